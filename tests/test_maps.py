@@ -548,6 +548,7 @@ def test_what_is_kept_of_a_long_drive_is_bounded(tmp_path: Path, monkeypatch: py
     estimates = [estimate for estimate, _, _ in drive(STREET, range(100), 3)]
     for estimate in estimates:
         driving.step(estimate, None)
+    driving.end()
     places = driving.places
     assert 8 <= len(places) <= 16
     ways = [place.T_map_ego.x_m for place in places]

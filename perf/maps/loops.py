@@ -4,7 +4,8 @@
 
 `recorded`: two passes of one KITTI street in each other's map, three other streets against both. `town`: rendered once
 into --drives (extra `train`), driven twice, then otherwise. `loop`: corners without images, twice. `alike`: equal
-houses: each loop is false. `scale`: a unit of length that drifts. `gnss`: fixes that jump. `size`: simulated descriptors of 1, 10, 100 km.
+houses: each loop is false. `scale`: a unit of length that drifts. `gnss`: fixes that jump. `size`: simulated
+descriptors of 1, 10, 100 km.
 """
 
 from __future__ import annotations
