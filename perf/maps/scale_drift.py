@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 
-import gtsam
 import numpy as np
 
+from birdslam.bench.baselines.batch_sim2 import places_in_sim2
 from birdslam.bench.simulation.places import block
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
@@ -82,21 +82,10 @@ def _measured(step: SE2, scale: float, error: Floats) -> SE2:
 
 def _closed(nodes: list[Node], links: list[Link], walk: float) -> Floats:
     """(N, 2) places of keyframes that have a scale each."""
-
-    def similarity(T: SE2) -> gtsam.Similarity2:
-        return gtsam.Similarity2(gtsam.Rot2(T.yaw_rad), gtsam.Point2(T.x_m, T.y_m), 1.0)
-
-    graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    for node in nodes:
-        start.insert(node.number, similarity(node.T_map_keyframe))
-    first = gtsam.noiseModel.Diagonal.Sigmas(np.array([1e-3, 1e-3, 1e-4, 1e-3]))
-    graph.add(gtsam.PriorFactorSimilarity2(0, similarity(nodes[0].T_map_keyframe), first))
+    edges = []
     for link in links:
         way_m = math.hypot(link.T_from_to.x_m, link.T_from_to.y_m)
         scale = UNKNOWN_SCALE if link.loop else walk * math.sqrt(max(way_m, 0.1))
-        noise = gtsam.noiseModel.Diagonal.Sigmas(np.append(np.sqrt(np.diag(link.cov)), scale))
-        T = similarity(link.T_from_to)
-        graph.add(gtsam.BetweenFactorSimilarity2(link.from_number, link.to_number, T, noise))
-    found = gtsam.LevenbergMarquardtOptimizer(graph, start).optimize()
-    solved = [found.atSimilarity2(node.number) for node in nodes]
-    return np.array([each.scale() * np.array(each.translation()) for each in solved])
+        sigmas = np.append(np.sqrt(np.diag(link.cov)), scale)
+        edges.append((link.from_number, link.to_number, link.T_from_to, sigmas))
+    return places_in_sim2([node.T_map_keyframe for node in nodes], edges)
