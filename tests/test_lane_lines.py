@@ -23,6 +23,8 @@ from birdslam.lanes.ego_lane import EgoLane
 from birdslam.lanes.line_tracker import LineTracker, still_lines
 from birdslam.lanes.occupancy import with_users
 from birdslam.lanes.outline import lane_mask, lane_px
+from birdslam.lanes.paint import LinePoints, paint_points
+from birdslam.lanes.road_view import road_view
 from birdslam.lanes.topology import lane_row
 from birdslam.lanes.traffic import Traffic, TrafficState
 from birdslam.lanes.users import UserInEgo, person_in_ego
@@ -183,17 +185,58 @@ def test_what_a_bonnet_mirrors_is_no_line_and_the_lane_is_not_drawn_over_it() ->
     assert area[:, 1].max() <= 166.0
 
 
-@pytest.mark.parametrize("gap_m", [0.1, 0.15])
-def test_two_stripes_side_by_side_are_one_double_line(gap_m: float) -> None:
+def with_two_stripes(gap_m: float, road_to_m: float) -> list[LaneLine]:
+    """The painted lines of a drive with two stripes about 1.75 m to the left, on a road that ends at `road_to_m`."""
     tracker = LineTracker(CAMERA)
+    v, u = np.indices((CAMERA.height_px, CAMERA.width_px))
+    x_m = CAMERA.fy_px * CAMERA.height_m / np.maximum(v - CAMERA.cy_px, 1e-3)
+    off_road = (CAMERA.cx_px - u) * x_m / CAMERA.fx_px > road_to_m
     for k in range(8):
         pose = SE2(1.5 * k, 0.0, 0.0)
         apart = 0.5 * (0.1 + gap_m)
         image, masks = picture(pose, (1.75 + apart, 1.75 - apart, -1.75), (False, False, True), stripe_m=0.1)
+        masks.road[off_road] = False
         tracker.update(pose, CAMERA.ground, (0.003, 0.0), image, masks, NOBODY)
-    found = [line for line in tracker.lines().at(pose) if line.kind is not LineKind.EDGE]
+    return [line for line in tracker.lines().at(pose) if line.kind is not LineKind.EDGE]
+
+
+@pytest.mark.parametrize("gap_m", [0.1, 0.15])
+def test_two_stripes_side_by_side_are_one_double_line(gap_m: float) -> None:
+    found = with_two_stripes(gap_m, 8.0)
     assert [line.kind for line in found] == [LineKind.DOUBLE, LineKind.DASHED]
     assert found[0].y_m(8.0) == pytest.approx(1.75, abs=0.1)
+
+
+def test_a_line_with_a_kerb_beside_it_is_no_double_line() -> None:
+    assert LineKind.DOUBLE not in [line.kind for line in with_two_stripes(0.1, 2.0)]
+
+
+def points_of(image: np.ndarray, masks: Segmentation) -> LinePoints:
+    return paint_points(road_view(CAMERA, GroundPlane(CAMERA.height_m), image, masks, NOBODY, None))
+
+
+def test_a_dash_between_cracks_is_no_symbol() -> None:
+    """Between two cracks asphalt is a bright band, which would make the dash an arrow."""
+    offset_m, seen = 1.7, []
+    for cracks_m in ((), (-0.35, 0.35)):
+        image, masks = picture(SE2(), (offset_m, -1.8), (True, False))
+        for aside_m in cracks_m:
+            ends_m = np.array([(9.3, offset_m + aside_m), (11.7, offset_m + aside_m)])
+            ends_px = bev.ego_to_pixel(CAMERA, GroundPlane(CAMERA.height_m), ends_m)
+            cv2.line(image, *np.round(ends_px).astype(int).tolist(), 20, 2)
+        points = points_of(image, masks)
+        on_dash = (np.abs(points.y_m - offset_m) < 0.15) & (points.x_m > 9.0) & (points.x_m < 12.0)
+        seen.append(int(on_dash.sum()))
+    clear, cracked = seen
+    assert cracked > 0.8 * clear > 5
+
+
+def test_grass_that_a_network_takes_for_road_and_paint_bears_no_line() -> None:
+    image, masks = picture(SE2(), (1.7, -1.8, -9.4), (True, False, False))
+    clear = points_of(image, masks)
+    cv2.circle(masks.road.view(np.uint8), (600, 135), 4, 1, -1)  # a scrap beside that line, beyond the road's edge
+    assert clear.y_m.min() > -8.5
+    assert points_of(image, masks).y_m.min() > -8.5
 
 
 def test_a_line_behind_a_car_stays() -> None:

@@ -83,7 +83,7 @@ def test_rows_are_medians_by_range_and_shares_inside_the_right_ellipses() -> Non
     errors = [CarError("a", k, 0, 20.0, e, float(e @ e), 0.0, 0.0) for k, e in enumerate(z)]
     errors.append(CarError("b", 0, 0, 45.0, np.array([-4.5, 0.2]), 9.0, math.pi, 0.0))
     rows = {(row.sequence, row.range): row for row in summarise_ranges(errors)}
-    parts = "ego drives", "ego stands", "0-0.5 s", "0.5-2 s", "2-5 s", "5-inf s", "over 1.75 m", "cut"
+    parts = "ego drives", "ego stands", "0-0.5 s", "0.5-2 s", "2-5 s", "5-inf s", "over 1.75 m", "chose none", "cut"
     assert list(rows) == [(s, r) for s in ("a", "b", "all", *parts) for r in ("0-15", "15-30", "30-50")]
     assert rows["a", "0-15"] == LocalisationRow(sequence="a", range="0-15", n=0)
     gauss = rows["a", "15-30"]
@@ -102,6 +102,26 @@ def test_rows_are_medians_by_range_and_shares_inside_the_right_ellipses() -> Non
     assert far.depth_bias_median_rel == pytest.approx(-0.1)
     assert far.yaw_error_median_deg == pytest.approx(0.0, abs=1e-6)
     assert pytest.approx((2.2957, 6.1801), abs=1e-3) == (INSIDE_1_SIGMA, INSIDE_2_SIGMA)
+
+
+def test_what_errors_are_made_of_is_told_apart() -> None:
+    rng = np.random.default_rng(0)
+    errors = []
+    for name in "abcdefghijklmnopqrst":
+        of_drive = rng.normal(0.0, 0.04)
+        for car in range(20):
+            of_car = of_drive + rng.normal(0.0, 0.03)
+            for k in range(10):
+                e = np.array([20.0 * (of_car + rng.normal(0.0, 0.02)), 0.0])
+                errors.append(CarError(name, k, car, 20.0, e, 1.0, 0.0, 0.0, sigma_depth_m=2.0))
+    (row,) = [row for row in summarise_ranges(errors) if (row.sequence, row.range) == ("all", "15-30")]
+    assert row.depth_stated_rel == pytest.approx(0.1)
+    assert row.within_cars_rel == pytest.approx(0.02 * math.sqrt(0.9), rel=0.05)
+    assert row.between_cars_rel == pytest.approx(math.hypot(0.03, 0.02 / math.sqrt(10)), rel=0.1)
+    assert row.between_sequences_rel == pytest.approx(0.04, rel=0.4)
+    alone = [row for row in summarise_ranges(errors[:10]) if (row.sequence, row.range) == ("a", "15-30")]
+    assert alone[0].between_cars_rel is None
+    assert alone[0].between_sequences_rel is None
 
 
 def test_real_boxes_of_cars_beat_the_level_ground(data_dir: Path) -> None:

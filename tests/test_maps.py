@@ -15,12 +15,12 @@ from hypothesis import strategies as st
 from birdslam.bench.simulation.places import CAMERA, OTHER_LIGHT_BITS, Street, along, block, build, drive
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.closing import close_loops, held
-from birdslam.loops.features import hamming, match
+from birdslam.loops.features import hamming, match, match_near
 from birdslam.loops.foot import body_pose, foot
 from birdslam.loops.keyframe import Link
 from birdslam.loops.localiser import Localisation
 from birdslam.loops.map_file import HEAD, MAGIC, MapError, decode_map, encode_map
-from birdslam.loops.map_pose import MapState
+from birdslam.loops.map_pose import MapPose, MapState, in_map
 from birdslam.loops.merging import MergeError, merged
 from birdslam.loops.place_index import PlaceIndex, learn_words
 from birdslam.loops.place_map import MapCamera, PlaceMap
@@ -202,6 +202,24 @@ def test_who_is_unsure_of_its_metres_is_localised_for_a_shorter_way(mapped: byte
             states.append(running.step(estimate, seen if number < 20 else None).state)  # type: ignore[arg-type]
         carried.append(sum(state is MapState.LOCALISED for state in states[20:]))
     assert 4 <= carried[1] < carried[0] / 2
+
+
+def test_a_pose_that_is_late_or_an_invalid_estimate_is_no_localisation() -> None:
+    estimate, _, _ = next(iter(drive(STREET, range(1), 3)))
+    pose = MapPose(
+        **{name: getattr(estimate, name) for name in ("frame_id", "t_source_ns", "t_capture_ns", "t_utc_ns", "epoch")},
+        **{
+            "state": MapState.LOCALISED,
+            "T_map_odom": SE2(),
+            "T_odom_ego": SE2(),
+            "cov": (1e-4, 0, 0, 0, 1e-4, 0, 0, 0, 1e-6),
+        },
+    )
+    states = [
+        in_map(pose, msgspec.structs.replace(estimate, t_source_ns=late_ns, valid=valid)).state
+        for late_ns, valid in ((900_000_000, True), (1_100_000_000, True), (100_000_000, False))
+    ]
+    assert states == [MapState.LOCALISED, MapState.ODOMETRY_ONLY, MapState.ODOMETRY_ONLY]
 
 
 def test_a_kidnapped_car_is_found_again(mapped: bytes) -> None:
@@ -417,6 +435,18 @@ def test_matches_are_each_others_nearest() -> None:
     pairs = match(hamming(a, a[order]), 60, 0.8)
     assert len(pairs) == 40
     assert (order[pairs[:, 1]] == pairs[:, 0]).all()
+
+
+def test_matches_within_a_radius_are_those_of_all_pairs() -> None:
+    chance = np.random.default_rng(4)
+    a = chance.integers(0, 256, (60, 32), dtype=np.uint8)
+    b = np.concatenate([a[::-1] ^ np.packbits(chance.random((60, 256)) < 0.2, axis=1), a[:20]])
+    a_px, b_px = chance.uniform(0.0, 100.0, (60, 2)), chance.uniform(0.0, 100.0, (80, 2))
+    far = np.hypot(*(a_px[:, None] - b_px[None]).transpose(2, 0, 1)) > 40.0
+    pairs = match(np.where(far, 10_000, hamming(a, b)), 100, 0.9)
+    assert len(pairs) > 5
+    assert np.array_equal(match_near(a, a_px, b, b_px, 40.0, 100, 0.9), pairs)
+    assert not len(match_near(a, a_px, b, b_px + 1000.0, 40.0, 100, 0.9))
 
 
 def test_the_index_finds_a_noisy_copy_and_only_among_those_allowed() -> None:

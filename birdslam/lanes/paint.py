@@ -19,6 +19,7 @@ SIDE_M = 0.28  # from a line's middle to the asphalt beside it; lines are up to 
 APART_M = 0.3  # between two ridges
 SYMBOL_M = 0.45  # wider paint is an arrow, a letter or a crossing's bar; lines are up to 0.3 m, and blurred by a pixel
 HEAD_M, HEAD_RATIO = 0.25, 1.4  # of an arrow's head, over its mean; a line is as wide all along
+CRACK_M = 0.2  # darker stripes up to it are filled before paint is told from asphalt
 SYMBOL_LENGTH_M = 9.0  # longer paint is a line, whatever it touches
 SYMBOL_SHARE = 0.5  # of the contrast of an image's brightest paint: kerbstones are paler
 BAND_M = 1.2  # the widest paint that stands out from its row
@@ -31,6 +32,7 @@ SIGMA_MASK_M = 0.08  # of a mask's middle
 PIXEL_SHARE = 0.7  # sigma of a ridge in pixels
 MOST_ROW_M = 0.4  # of road that a far row counts for
 UNSEEN_WEIGHT = 0.5  # of a ridge that no mask knows, as evidence
+SCRAP_SHARE = 0.1  # of the largest piece of the road's mask: a smaller one is a scrap
 ROAD_REACH_M = 0.4  # a line at the road's edge lies partly outside its mask
 GAP_M = 0.25  # of the road's mask: what is less is a mark's border, or noise; a kerb is wider
 # Two stripes are a double line: so far apart from middle to middle at the most, alike, with asphalt between
@@ -76,7 +78,7 @@ def paint_points(view: RoadView) -> LinePoints:
     symbols = _symbols(view, response, usable, least)
     rows, columns, masked = _ridges(view, response, least, usable & ~symbols)
     ridge_y = view.y_m[columns] + _shift_m(view, rows, columns)
-    alone_rows, alone_y = _mask_middles(view, symbols, rows, columns)
+    alone_rows, alone_y = _mask_middles(view, usable & ~symbols, rows, columns)
     rows = np.concatenate([rows, alone_rows])
     y_m = np.concatenate([ridge_y, alone_y])
     by_mask = np.concatenate([np.zeros(len(ridge_y), bool), np.ones(len(alone_y), bool)])
@@ -111,7 +113,7 @@ def _response(view: RoadView) -> Floats32:
 def _bar(view: RoadView, response: Floats32) -> tuple[float, Bools]:
     """The least response of a ridge, and where one may be: on the road and at its border."""
     reach = 2 * round(ROAD_REACH_M / LATTICE_M) + 1
-    on_road = cv2.dilate(view.road.view(np.uint8), np.ones((1, reach), np.uint8)) > 0
+    on_road = cv2.dilate(_without_scraps(view).view(np.uint8), np.ones((1, reach), np.uint8)) > 0
     usable = on_road & ~view.hidden & ~view.outside
     bare = response[::2, ::3][usable[::2, ::3]]  # a sixth shows the spread as well
     if not len(bare):
@@ -122,6 +124,19 @@ def _bar(view: RoadView, response: Floats32) -> tuple[float, Bools]:
     return max(LEAST_CONTRAST, NOISE_FACTOR * spread + min(middle, 0.0)), usable
 
 
+def _without_scraps(view: RoadView) -> Bools:
+    """(R, C) the road's mask without what is small and joined to no road: grass and gravel that a network takes for it.
+
+    What vehicles cover joins the road on both sides of them.
+    """
+    joined = (view.road | view.paint | view.hidden).view(np.uint8)
+    _, labels, boxes, _ = cv2.connectedComponentsWithStats(joined, connectivity=4)
+    area = boxes[:, cv2.CC_STAT_AREA]
+    area[0] = 0
+    large: Bools = area > SCRAP_SHARE * area.max()
+    return view.road & large[labels]
+
+
 def _symbols(view: RoadView, response: Floats32, usable: Bools, least: float) -> Bools:
     """(R, C) arrows and letters: short connected paint, as bright as the brightest, that is wider than a line."""
     out = np.zeros(usable.shape, bool)
@@ -130,7 +145,9 @@ def _symbols(view: RoadView, response: Floats32, usable: Bools, least: float) ->
         return out
     contrast = max(least, SYMBOL_SHARE * float(np.quantile(strong, 0.9)))
     band = np.ones((1, round(BAND_M / LATTICE_M) | 1), np.uint8)
-    bright = usable & (cv2.morphologyEx(view.grey, cv2.MORPH_TOPHAT, band) > contrast)
+    crack = np.ones((1, round(CRACK_M / LATTICE_M) | 1), np.uint8)  # between two of them asphalt is a bright band
+    asphalt = cv2.morphologyEx(cv2.morphologyEx(view.grey, cv2.MORPH_CLOSE, crack), cv2.MORPH_OPEN, band)
+    bright = usable & (view.grey - asphalt > contrast)
     count, labels, boxes, _ = cv2.connectedComponentsWithStats(bright.view(np.uint8), connectivity=8)
     row, first, past = _runs(bright)
     width, label = (past - first) * LATTICE_M, labels[row, first]
@@ -183,7 +200,10 @@ def _shift_m(view: RoadView, rows: Ints, columns: Ints) -> Floats:
 
 
 def double_share(view: RoadView, points: LinePoints) -> float | None:
-    """The share of a line's points that two stripes side by side make; None where the image does not resolve them."""
+    """The share of a line's points that two stripes side by side make, with road on either hand.
+
+    None where the image does not resolve them. Kerbs and gravel beside a line at the road's edge look like a stripe.
+    """
     rows = np.clip(np.searchsorted(view.x_m, points.x_m), 0, len(view.x_m) - 1)
     rows, y_m = rows[fine := view.sigma_y_m[rows] < DOUBLE_PIXEL_M], points.y_m[fine]
     if len(rows) < LEAST_DOUBLE:
@@ -201,10 +221,12 @@ def double_share(view: RoadView, points: LinePoints) -> float | None:
         stripes = (weaker > LEAST_CONTRAST) & (weaker > STRIPE_SHARE * above.max(axis=1, keepdims=True))
         double |= (stripes & (between < GAP_SHARE * weaker)).any(axis=1)
         between = np.minimum(between[:, :-1], above[:, apart:-1])
-    return float(double.mean())
+    beyond = round((DOUBLE_M + SIDE_M) / LATTICE_M)
+    either = np.clip(middle[:, None] + [-beyond, beyond], 0, len(view.y_m) - 1)
+    return float((double & view.road[rows[:, None], either].all(axis=1)).mean())
 
 
-def _mask_middles(view: RoadView, symbols: Bools, rows: Ints, columns: Ints) -> tuple[Ints, Floats]:
+def _mask_middles(view: RoadView, usable: Bools, rows: Ints, columns: Ints) -> tuple[Ints, Floats]:
     """Rows and y of the middles of the mask's bands that have no ridge."""
     row, first, past = _runs(view.paint)
     wide = (past - first) * LATTICE_M
@@ -213,7 +235,7 @@ def _mask_middles(view: RoadView, symbols: Bools, rows: Ints, columns: Ints) -> 
     ridge = ridge.cumsum(axis=1)
     reach = round(MASK_REACH_M / LATTICE_M)
     low, high = np.maximum(first - reach, 0), np.minimum(past + reach, len(view.y_m))
-    bare = (ridge[row, high] - ridge[row, low] == 0) & (wide < WIDEST_M) & ~symbols[row, (first + past) // 2]
+    bare = (ridge[row, high] - ridge[row, low] == 0) & (wide < WIDEST_M) & usable[row, (first + past) // 2]
     at = 0.5 * (first + past - 1)[bare]
     out: Floats = view.y_m[0] + at * LATTICE_M
     return row[bare], out

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.geometry.arrays import Bools, Floats, Floats32, Ints
+from birdslam.geometry.arrays import Floats, Floats32, Ints
 
 DESCRIPTOR_BYTES = 32
 MOST_FEATURES = 900  # of an image
@@ -113,15 +113,48 @@ def hamming(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> Ints:
     return out.astype(np.int64)
 
 
+def match_near(
+    a: NDArray[np.uint8],
+    a_px: Floats,
+    b: NDArray[np.uint8],
+    b_px: Floats,
+    radius_px: float,
+    most_bits: int,
+    ratio: float,
+) -> Ints:
+    """As `match`, of descriptors (N, 32) and (M, 32) whose pixels lie within a radius: no others are compared."""
+    from scipy.spatial import cKDTree  # here: only who has a guess needs it
+
+    if not len(a) or not len(b):
+        return np.zeros((0, 2), np.int64)
+    near = cKDTree(b_px).query_ball_point(a_px, radius_px)
+    rows = np.repeat(np.arange(len(a)), [len(each) for each in near])
+    columns = np.array([column for each in near for column in each], np.int64)
+    if not len(rows):
+        return np.zeros((0, 2), np.int64)
+    words = np.ascontiguousarray(a).view(np.uint64)[rows] ^ np.ascontiguousarray(b).view(np.uint64)[columns]
+    distance = np.bitwise_count(words).sum(axis=1).astype(np.int64)
+    order = np.lexsort((columns, distance, rows))
+    rows, columns, distance = rows[order], columns[order], distance[order]
+    first = np.flatnonzero(np.diff(rows, prepend=-1))
+    second = np.append(distance, NEVER)[first + 1]
+    second[np.append(rows, -1)[first + 1] != rows[first]] = NEVER
+    back = np.lexsort((rows, distance, columns))
+    nearest_row = np.full(len(b), -1)
+    ends = np.flatnonzero(np.diff(columns[back], prepend=-1))
+    nearest_row[columns[back][ends]] = rows[back][ends]
+    good = (distance[first] <= most_bits) & (distance[first] < ratio * second)
+    good &= nearest_row[columns[first]] == rows[first]
+    return np.column_stack([rows[first], columns[first]])[good]
+
+
 NEVER = 10_000  # bits: more than any two descriptors differ by
 
 
-def match(distance: Ints, most_bits: int, ratio: float, allowed: Bools | None = None) -> Ints:
+def match(distance: Ints, most_bits: int, ratio: float) -> Ints:
     """(K, 2) pairs (row, column) that are each other's nearest, clearly so by Lowe's ratio test."""
     if distance.shape[0] < 1 or distance.shape[1] < 2:
         return np.zeros((0, 2), np.int64)
-    if allowed is not None:
-        distance = np.where(allowed, distance, NEVER)
     two = np.partition(distance, 1, axis=1)[:, :2]
     nearest = distance.argmin(axis=1)
     back = distance.argmin(axis=0)

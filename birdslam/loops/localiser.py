@@ -26,6 +26,7 @@ CANDIDATES = 6  # places that are verified by geometry in one frame
 FOUND_INLIERS, FOUND_PLACES = 25, 7  # of a frame that nothing was known of
 FOUND_SHARE = 0.3  # of its matches that must fit
 KEPT_INLIERS, KEPT_PLACES = 18, 6  # of a frame that was foreseen
+AMPLE_INLIERS = 40  # with fewer, farther keyframes are looked at too
 CONFIRMATIONS = 2  # further frames that must say the same
 KIDNAPPED_CONFIRMATIONS = 12  # where odometry since the last fix contradicts them: it was cut, or the place is another
 HYPOTHESES = 4
@@ -170,10 +171,15 @@ class Localiser:
         rows = self.map.near(guess, FOLLOW_M, among)
         if not rows:
             return None
-        local = self.map.around(rows[0], among)
         sigma_rad = math.sqrt(cov[2, 2]) + math.sqrt(max(cov[0, 0], cov[1, 1])) / 10.0  # of a point 10 m away
         radius_px = min(SEARCH_PX + 3.0 * sigma_rad * self._camera.fx_px, MOST_SEARCH_PX)
-        fix = locate(self._camera, features, local, local.keyframe.T_map_keyframe.between(guess), radius_px)
+        T_keyframe_ego = self.map.keyframes[rows[0]].T_map_keyframe.between(guess)
+        fix = None
+        for far in (False, True):
+            found = locate(self._camera, features, self.map.around(rows[0], among, far), T_keyframe_ego, radius_px)
+            fix = found if fix is None or (found is not None and found.inliers > fix.inliers) else fix
+            if fix is not None and fix.inliers >= AMPLE_INLIERS:
+                break
         if fix is None or fix.inliers < KEPT_INLIERS or fix.places < KEPT_PLACES:
             return None
         error = guess.between(fix.T_map_ego).log()

@@ -14,7 +14,7 @@ import numpy as np
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.drift import is_exact, moved
-from birdslam.types import Cov2, Cov3, Estimate, Word
+from birdslam.types import NS_PER_S, Cov2, Cov3, Estimate, Word
 
 
 class MapState(Word):
@@ -69,11 +69,16 @@ class InMap:
     pose: MapPose | None  # by which it was brought there; none: the map process never said one
 
 
+STALE_NS = NS_PER_S  # of an older pose nobody knows what odometry has been through since
+
 NOWHERE = InMap(MapState.LOST, None, np.full((3, 3), np.inf), 0, None)
 
 
 def in_map(pose: MapPose | None, estimate: Estimate) -> InMap:
-    """The ego of an estimate in the map, by the newest pose that is known; lost where that is of another epoch."""
+    """The ego of an estimate in the map, by the newest pose that is known; lost where that is of another epoch.
+
+    Only `odometry_only` where the estimate is not valid, or over a second newer than the pose.
+    """
     if pose is None:
         return NOWHERE
     if pose.epoch != estimate.epoch or pose.T_map_odom is None or pose.T_odom_ego is None or pose.cov is None:
@@ -81,6 +86,7 @@ def in_map(pose: MapPose | None, estimate: Estimate) -> InMap:
     step = pose.T_odom_ego.between(estimate.T_world_ego)
     cov = moved(np.array(pose.cov).reshape(3, 3), step, scale_rel=estimate.scale_sigma_rel)
     state = pose.state
-    if state is MapState.LOCALISED and not is_exact(cov):
+    stale = estimate.t_source_ns - pose.t_source_ns > STALE_NS
+    if state is MapState.LOCALISED and (stale or not estimate.valid or not is_exact(cov)):
         state = MapState.ODOMETRY_ONLY
     return InMap(state, pose.T_map_odom @ estimate.T_world_ego, cov, pose.map_epoch, pose)

@@ -23,8 +23,8 @@ from birdslam.loops.place_index import LEARNED_FROM, PlaceIndex, index_of, learn
 from birdslam.loops.verification import LocalMap
 from birdslam.types import LineColour, LineKind
 
-NEIGHBOUR_M = 9.0  # keyframes this near help each other
-NEIGHBOURS = 3
+NEIGHBOUR_M, NEIGHBOURS = 9.0, 3  # keyframes this near help each other
+FAR_NEIGHBOUR_M, FAR_NEIGHBOURS = 17.0, 7  # and these where that is too little
 MOST_GAP_M = 8.0  # between two pieces of one line
 EARTH_REACH_M = 100.0  # a place on Earth is that of the keyframes around it
 SAME_HEADING_RAD = math.radians(60.0)
@@ -196,8 +196,9 @@ class PlaceMap:
         rows = np.flatnonzero(fits)
         return [int(row) for row in rows[np.argsort(distance[rows], kind="stable")]]
 
-    def around(self, row: int, among: Bools | None = None) -> LocalMap:
-        """A keyframe with those beside it."""
+    def around(self, row: int, among: Bools | None = None, far: bool = False) -> LocalMap:
+        """A keyframe with those beside it, or with farther ones too."""
         own = self.keyframes[row]
-        rows = [other for other in self.near(own.T_map_keyframe, NEIGHBOUR_M, among) if other != row]
-        return LocalMap.around(own, [self.keyframes[other] for other in rows[: NEIGHBOURS - 1]])
+        reach_m, most = (FAR_NEIGHBOUR_M, FAR_NEIGHBOURS) if far else (NEIGHBOUR_M, NEIGHBOURS)
+        rows = [other for other in self.near(own.T_map_keyframe, reach_m, among) if other != row]
+        return LocalMap.around(own, [self.keyframes[other] for other in rows[: most - 1]])

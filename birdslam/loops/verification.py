@@ -19,7 +19,7 @@ from birdslam.geometry.arrays import Bools, Floats, Ints
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import rotation_exp
 from birdslam.geometry.se2 import SE2
-from birdslam.loops.features import Features, hamming, match
+from birdslam.loops.features import Features, hamming, match, match_near
 from birdslam.loops.foot import body_pose, foot
 from birdslam.loops.keyframe import Keyframe
 from birdslam.loops.triangulation import cross
@@ -34,6 +34,10 @@ GATE = 3.0  # standard deviations of a coordinate
 SIGMA_Z_M, SIGMA_TILT_RAD = 0.15, 0.03  # of a car on a road that another drive mapped
 ITERATIONS = 12
 NARROWER = 3.0  # by which the weights' bell shrinks from one iteration to the next
+NARROWEST = 9.0  # its width at the end, as a chi-square
+# For residuals as foreseen the weighed mean of chi-square is 1.49, and the covariance .81 of the weighed system's (the
+# asymptotic variance of an M-estimator, Huber 1981); of larger ones both grow
+MEAN_CHI2, EFFICIENCY = 1.4911, 0.8105
 OTHER_VIEW_PX = 1.0  # 1-sigma of a corner found anew from another place and at another time, besides its own noise
 
 
@@ -149,18 +153,18 @@ def _guided(camera: Camera, features: Features, local: LocalMap, pose: Transform
     """Matches within `radius_px` of where the pose puts each point."""
     T = _camera_pose(camera, pose)
     p = local.points_m @ T[:3, :3].T + T[:3, 3]
-    ahead = p[:, 2] > 1.0
-    px = camera.to_px(p[:, :2] / np.maximum(p[:, 2:], 1e-3))
-    near = ((px[:, None, :] - features.px[None, :, :]) ** 2).sum(axis=2) < radius_px**2
-    distance = hamming(local.descriptors, features.descriptors)
-    pairs = match(distance, GUIDED_BITS, GUIDED_RATIO, near & ahead[:, None])
-    return pairs
+    rows = np.flatnonzero(p[:, 2] > 1.0)
+    px = camera.to_px(p[rows, :2] / p[rows, 2:])
+    pairs = match_near(
+        *(local.descriptors[rows], px, features.descriptors, features.px, radius_px), GUIDED_BITS, GUIDED_RATIO
+    )
+    return np.column_stack([rows[pairs[:, 0]], pairs[:, 1]])
 
 
 def _adjust(
     camera: Camera, features: Features, local: LocalMap, pairs: Ints, pose: Transform
 ) -> tuple[Transform, Floats, Bools] | None:
-    """Gauss-Newton with Cauchy weights: T_keyframe_ego (4, 4), the covariance of (x, y, yaw), and the inliers.
+    """Gauss-Newton with weights of Geman and McClure: T_keyframe_ego (4, 4), covariance of (x, y, yaw), inliers.
 
     Graduated (Black and Rangarajan 1996): the weights are wide at first, or far points alone would hold a wrong guess.
     """
@@ -190,8 +194,8 @@ def _adjust(
         error = xy - predicted
         chi2 = (error * (W @ error[:, :, None])[:, :, 0]).sum(axis=1)
         good = (chi2 < GATE**2) & (p[:, 2] > 0.5)
-        width = max(min(width / NARROWER, float(np.median(chi2))), 4.0)
-        weight = (p[:, 2] > 0.5) / (1.0 + chi2 / width)
+        width = max(min(width / NARROWER, float(np.median(chi2))), NARROWEST)
+        weight = (p[:, 2] > 0.5) / (1.0 + chi2 / width) ** 2
         weighed = (weight[:, None, None] * (W @ J)).reshape(-1, 6)
         H = weighed.T @ J.reshape(-1, 6)
         g = weighed.T @ error.ravel()
@@ -204,7 +208,7 @@ def _adjust(
         pose = pose.copy()
         pose[:3, 3] += pose[:3, :3] @ np.clip(step[:3], -2.0, 2.0)
         pose[:3, :3] = pose[:3, :3] @ rotation_exp(step[3:])
-        if width == 4.0 and float(np.abs(step).max()) < 1e-5:
+        if width == NARROWEST and float(np.abs(step).max()) < 1e-5:
             break
     if not good.any() or abs(pose[2, 3]) > 1.5 or math.hypot(*pose[:2, 3]) > 60.0:
         return None
@@ -212,5 +216,5 @@ def _adjust(
     J_foot = np.array([[1, 0, 0, 0, h, 0], [0, 1, 0, -h, 0, 0], [0, 0, 0, 0, 0, 1]])  # the foot, by a step of the body
     cov: Floats = J_foot @ np.linalg.inv(H) @ J_foot.T
     # The a posteriori variance of unit weight: residuals of an image with few right matches are larger than foreseen
-    cov *= max(1.0, float((weight * chi2).sum() / (2.0 * weight.sum())))
+    cov *= EFFICIENCY * max(1.0, float((weight * chi2).sum() / weight.sum()) / MEAN_CHI2)
     return pose, cov, good

@@ -38,6 +38,7 @@ MEASURED_KIND = "Car"
 MOST = 25.0  # squared Mahalanobis distance of a car, at the most: five sigma
 STANDS_MPS = 1.0  # an ego that is slower stands or nearly
 TALL_M = 1.75  # of a label: taller than nearly all cars
+CHOSE_NOTHING = ("0012", "0013", "0014", "0016", "0017")  # of places; docs/constants.md has the few priors by labels
 AGES_S = ((0.0, 0.5), (0.5, 2.0), (2.0, 5.0), (5.0, math.inf))  # since the vehicle's first edge
 
 
@@ -57,6 +58,7 @@ class CarError:
     height_m: float = 0.0  # of the label
     ego_mps: float = math.inf  # the ego's speed
     age_s: float = 0.0  # since the vehicle's first edge
+    sigma_depth_m: float = 0.0  # 1-sigma along ego's x, as the edge states it
 
 
 class LocalisationRow(msgspec.Struct, frozen=True, kw_only=True):
@@ -77,6 +79,13 @@ class LocalisationRow(msgspec.Struct, frozen=True, kw_only=True):
     # The same shares with each car counted once, in however many frames: errors of one last while it is seen
     inside_1_sigma_by_car: float | None = None
     inside_2_sigma_by_car: float | None = None
+    # RMS of relative errors of the depth and of the sigmas that edges state, and what the errors are made of: what
+    # changes while a car is seen, what differs between the cars of a sequence, and between sequences
+    depth_rms_rel: float | None = None
+    depth_stated_rel: float | None = None
+    within_cars_rel: float | None = None
+    between_cars_rel: float | None = None
+    between_sequences_rel: float | None = None
 
 
 class TiltRow(msgspec.Struct, frozen=True, kw_only=True):
@@ -178,14 +187,15 @@ def _error(
         height_m=label.height_m,
         ego_mps=ego_mps,
         age_s=age_s,
+        sigma_depth_m=math.sqrt(float(cov[0, 0])),
     )
 
 
 def summarise_ranges(errors: Sequence[CarError]) -> list[LocalisationRow]:
     """A row for each sequence and range, then those of the union, "all", of cars that the image does not cut.
 
-    After them those of parts of all: by whether the ego drives, by the age of the track, tall cars, and cars that the
-    image cuts.
+    After them those of parts of all: by whether the ego drives, by the age of the track, tall cars, cars of sequences
+    that chose none of the constants, and cars that the image cuts.
     """
     whole = [e for e in errors if not e.cut]
     names = list(dict.fromkeys(error.sequence for error in errors))
@@ -195,6 +205,7 @@ def summarise_ranges(errors: Sequence[CarError]) -> list[LocalisationRow]:
         ("ego stands", lambda e: e.ego_mps < STANDS_MPS),
         *((f"{low:g}-{high:g} s", lambda e, low=low, high=high: low <= e.age_s < high) for low, high in AGES_S),
         (f"over {TALL_M} m", lambda e: e.height_m > TALL_M),
+        ("chose none", lambda e: e.sequence in CHOSE_NOTHING),
     ]
     groups += [(name, [e for e in whole if of_it(e)]) for name, of_it in parts]
     groups.append(("cut", [e for e in errors if e.cut]))
@@ -215,6 +226,11 @@ def _row(sequence: str, span: str, errors: Sequence[CarError]) -> LocalisationRo
     once = 1.0 / sights[car]
     # A heading and its opposite look alike in a box; the footprint is the same
     turned = np.array([abs(wrap(2.0 * e.yaw_error_rad)) / 2.0 for e in errors])
+    relative = along / depth_m
+    of_car = np.bincount(car, relative) / sights  # (cars,)
+    _, first = np.unique(car, return_index=True)
+    _, drive, cars = np.unique([errors[k].sequence for k in first], return_inverse=True, return_counts=True)
+    of_drive = np.bincount(drive, of_car) / cars
     return LocalisationRow(
         sequence=sequence,
         range=span,
@@ -230,4 +246,18 @@ def _row(sequence: str, span: str, errors: Sequence[CarError]) -> LocalisationRo
         yaw_off_10_deg=float(np.mean(turned > math.radians(10.0))),
         inside_1_sigma_by_car=float(np.average(spread <= INSIDE_1_SIGMA, weights=once)),
         inside_2_sigma_by_car=float(np.average(spread <= INSIDE_2_SIGMA, weights=once)),
+        depth_rms_rel=_rms(relative),
+        depth_stated_rel=_rms(np.array([e.sigma_depth_m for e in errors]) / depth_m),
+        within_cars_rel=_rms(relative - of_car[car]),
+        between_cars_rel=_scatter(of_car - of_drive[drive], len(of_car) - len(of_drive)),
+        between_sequences_rel=_scatter(of_drive - of_drive.mean(), len(of_drive) - 1),
     )
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _scatter(deviations: Floats, freedom: int) -> float | None:
+    """Of deviations from means, with so many degrees of freedom; None without any."""
+    return math.sqrt(float(np.square(deviations).sum()) / freedom) if freedom > 0 else None

@@ -74,6 +74,8 @@ def run(options: argparse.Namespace) -> int:
         write_json(output / "movers.json", movers)
         print(_table(rows))
         print()
+        print(_table_of_parts(rows))
+        print()
         print(_table_of_tilts(tilts))
         print()
         print(movers_table(movers))
@@ -122,6 +124,16 @@ def _table(rows: Sequence[LocalisationRow]) -> str:
         shares = row.yaw_off_10_deg, row.inside_1_sigma_by_car, row.inside_2_sigma_by_car
         more = _in_columns(((row.nees, "7.2f"), *((share, "9.0%") for share in shares)))
         lines.append(f"{row.sequence:12}{row.range:>9}{row.cars:>6}{row.n:>7}{_places(row)}{more}")
+    return "\n".join(lines)
+
+
+def _table_of_parts(rows: Sequence[LocalisationRow]) -> str:
+    titles = f"{'RMS':>9}{'stated':>9}{'in cars':>9}{'cars':>9}{'drives':>9}"
+    lines = [f"{'':12}{'range m':>9}{titles}  error of depth: within a car's sights, between cars, between sequences"]
+    for row in rows:
+        of = row.within_cars_rel, row.between_cars_rel, row.between_sequences_rel
+        parts = _in_columns((part, "9.1%") for part in (row.depth_rms_rel, row.depth_stated_rel, *of))
+        lines.append(f"{row.sequence:12}{row.range:>9}{parts}")
     return "\n".join(lines)
 
 
