@@ -8,6 +8,7 @@ import resource
 import shutil
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -173,8 +174,6 @@ def test_who_computes_little_goes_before_networks(monkeypatch: pytest.MonkeyPatc
     nice: list[int] = []
     monkeypatch.setattr(os, "sched_setscheduler", lambda thread, policy, param: by_fifo.append(param.sched_priority))
     monkeypatch.setattr(os, "setpriority", lambda which, thread, value: nice.append(value))
-    assert list(realtime.apply("perceive", at_rate(33.0))) == []
-    assert (by_fifo, nice) == ([], [])
     assert list(realtime.apply("optimize", at_rate(33.0))) == []
     assert ({*by_fifo}, nice) == ({scheduled().realtime.optimize.priority}, [])
     monkeypatch.setattr(os, "sched_setscheduler", refused)  # of whoever may not
@@ -183,6 +182,27 @@ def test_who_computes_little_goes_before_networks(monkeypatch: pytest.MonkeyPatc
     assert max(nice) < 0
     monkeypatch.setattr(os, "setpriority", refused)  # nor that
     assert list(realtime.apply("optimize", at_rate(33.0))) == []
+
+
+def test_of_perceive_the_frames_go_before_the_networks(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[int, int, int]] = []
+    monkeypatch.setattr(realtime, "frames_alone", threading.Event())
+    monkeypatch.setattr(
+        os, "sched_setscheduler", lambda thread, policy, of: asked.append((thread, policy, of.sched_priority))
+    )
+    monkeypatch.setattr(realtime, "usable_cores", lambda: 1.0)
+    assert list(realtime.apply("perceive", at_rate(33.0))) == []
+    realtime.below_frames()
+    assert asked == []  # they would leave the networks no core
+    monkeypatch.setattr(realtime, "usable_cores", lambda: 2.0)
+    assert list(realtime.apply("perceive", at_rate(33.0))) == []
+    realtime.below_frames()
+    frames = (threading.get_native_id(), os.SCHED_FIFO, scheduled().realtime.perceive.priority)
+    assert asked == [frames, (0, os.SCHED_OTHER, 0)]  # this thread alone, then one of a network
+    monkeypatch.setattr(realtime, "frames_alone", threading.Event())
+    monkeypatch.setattr(os, "sched_setscheduler", refused)
+    assert list(realtime.apply("perceive", at_rate(33.0))) == []
+    realtime.below_frames()  # asks for nothing where nothing was given
 
 
 @pytest.mark.parametrize("configuration", [scheduled(), at_rate(1000.0)])

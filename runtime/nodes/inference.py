@@ -94,7 +94,7 @@ class Inference(Closing):
         self._rate_divisor = configuration.degradation.rate_divisor
         self._ran_frame = -self._rate_divisor  # the last frame that networks were offered
         self._started: list[Future[Any]] = []  # for the frame at hand, and awaited
-        self._threads = ThreadPoolExecutor(max(1, len(heads)), thread_name_prefix="network")
+        self._threads = ThreadPoolExecutor(max(1, len(heads)), "network", initializer=realtime.below_frames)
         self._behind = ThreadPoolExecutor(max(1, len(heads)), "network-behind", initializer=realtime.lower_priority)
         self._beside = ThreadPoolExecutor(1, "beside", initializer=realtime.lower_priority)
         self._frame_over = threading.Event()

@@ -13,9 +13,10 @@ import os
 import resource
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 from birdslam.runtime.configuration import Configuration
+from birdslam.runtime.process.cores import usable_cores
 
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 _CAP_IPC_LOCK, _CAP_SYS_NICE = 14, 23
@@ -26,6 +27,9 @@ _MIB = 1 << 20
 # Nodes that compute for 2 ms of a frame and then wait: they may preempt the networks, and never the other way round. On
 # two cores, beside perceive alone, a step of the optimizer took p99 2.3 to 4.6 ms at SCHED_FIFO, 4.5 to 11.8 at nice -5
 _FIRST, _FIRST_NICE = ("capture", "optimize"), -5
+# Of perceive the thread of the frames, and the bus's, which it begins; its networks get what is left, a core or more.
+# On two cores beside other work that thread waited for a core for p99 25 ms of a frame, at SCHED_FIFO for 7
+_FRAMES, _FRAMES_CORES = "perceive", 2.0
 _LEAST_PERIOD_MS = 10.0  # of frames, for SCHED_FIFO: at more than 100 Hz they would leave no core to the others
 _LOWER_NICE = 5  # nicer: a third of the time that one gets that wants the same core and is not
 _NICEST = 19
@@ -35,6 +39,7 @@ NODE_OBJECTS_MIB, NODE_HEAP_MIB = 8.0, 4.0
 
 _TUPLE_SIZES, _TUPLES_KEPT = range(1, 21), 2_000  # what CPython keeps of freed ones, of each size
 
+frames_alone = threading.Event()  # SCHED_FIFO is of the frames' thread, not of the networks'
 _anchors: list[bytes] = []  # for ever: memory that holds one of these is not given back
 
 
@@ -52,7 +57,10 @@ def apply(node: str, configuration: Configuration) -> Iterator[str]:
     every = realtime.fifo == "on" or (realtime.fifo == "auto" and live)
     first = node in _FIRST and not configuration.lossless
     seldom = (configuration.perceive.period_ms or 0.0) >= _LEAST_PERIOD_MS
-    by_fifo = (every or (first and seldom and realtime.fifo == "auto")) and _by_fifo(scheduling.priority)
+    by_fifo = (every or (first and seldom and realtime.fifo == "auto")) and _by_fifo(_threads(), scheduling.priority)
+    frames = node == _FRAMES and not every and not configuration.lossless and usable_cores() >= _FRAMES_CORES
+    if frames and seldom and realtime.fifo == "auto" and _by_fifo([threading.get_native_id()], scheduling.priority):
+        frames_alone.set()
     if every and not by_fifo:
         yield "realtime.fifo: SCHED_FIFO is not permitted (LimitRTPRIO=, CAP_SYS_NICE): runs at normal priority"
     if first and not by_fifo:
@@ -67,18 +75,25 @@ def apply(node: str, configuration: Configuration) -> Iterator[str]:
             yield f"realtime.lock_memory: {os.strerror(ctypes.get_errno())}: memory may be paged out"
 
 
-def _by_fifo(priority: int) -> bool:
-    """Runs this process at SCHED_FIFO; False where that is not permitted."""
+def _by_fifo(threads: Iterable[int], priority: int) -> bool:
+    """Runs these threads, and those that they begin, at SCHED_FIFO; False where that is not permitted."""
     try:
-        for thread in _threads():
+        for thread in threads:
             os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
     except PermissionError:
         return False
     return True
 
 
+def below_frames() -> None:
+    """The calling thread runs a network that frames wait for: not at SCHED_FIFO, where that is the frames' alone."""
+    if frames_alone.is_set():
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
 def lower_priority() -> None:
     """Lowers the calling thread's priority below the others of its process and the other nodes."""
+    below_frames()
     if os.sched_getscheduler(0) == os.SCHED_FIFO:
         priority = os.sched_getparam(0).sched_priority
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(max(priority - 1, 1)))
