@@ -10,7 +10,7 @@ from birdslam.frontend import FrontEndConfig
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.weights import PAPER_WEIGHTS
 from birdslam.odometry.odometry import OdometryConfig
-from birdslam.odometry.road.kalman_filter import RoadScaleConfig
+from birdslam.odometry.scale_config import RoadScaleConfig
 from birdslam.slam import SlamConfig
 from birdslam.vehicles.placement.depth_fusion import PseudoLidarConfig
 from birdslam.vehicles.placement.localisation import LocalisationConfig

@@ -16,7 +16,8 @@ from birdslam.odometry.motion import Motion
 from birdslam.odometry.odometry import Odometry, OdometryConfig
 from birdslam.odometry.plausibility import PlausibilityConfig, PlausibilityGate
 from birdslam.odometry.road.fit import RoadFit
-from birdslam.odometry.road.kalman_filter import CAR_DELAY, CAR_FACTOR, STATES, RoadFilter, RoadScaleConfig
+from birdslam.odometry.road.kalman_filter import CAR_DELAY, CAR_FACTOR, STATES, RoadFilter
+from birdslam.odometry.scale_config import RoadScaleConfig
 from birdslam.odometry.speed.readings import CarSpeedConfig, SpeedReadings
 from birdslam.odometry.speed.scale import SpeedScale
 from birdslam.types import INVALIDATING, NS_PER_S, EgoEdge, Measurements, SpeedReading, SpeedSource, Status

@@ -19,7 +19,8 @@ from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.odometry.road.fit import RoadFit
-from birdslam.odometry.road.kalman_filter import RoadFilter, RoadScaleConfig
+from birdslam.odometry.road.kalman_filter import RoadFilter
+from birdslam.odometry.scale_config import RoadScaleConfig
 from birdslam.types import EgoEdge, Estimate, Measurements, VehicleEdge
 from tests.recordings import KITTI as CAMERA
 

@@ -13,7 +13,7 @@ from birdslam.odometry.corners.keyframes import KeyframeConfig, KeyframeWindow
 from birdslam.odometry.corners.resection import resect
 from birdslam.odometry.corners.sliding_window import match_ids
 from birdslam.odometry.median import quantile
-from birdslam.odometry.road.kalman_filter import RoadScaleConfig
+from birdslam.odometry.scale_config import RoadScaleConfig
 
 FOCAL_PX, HALF_XY = 370.0, (0.86, 0.26)  # of the shipped drive's camera; half the image in normalised coordinates
 STEP_M = 0.45

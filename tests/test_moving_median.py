@@ -14,9 +14,9 @@ from birdslam.geometry.pose import Pose
 from birdslam.odometry.corners.sliding_window import SlidingWindow
 from birdslam.odometry.metric_scale import RoadView
 from birdslam.odometry.odometry import Odometry, OdometryConfig
-from birdslam.odometry.road.kalman_filter import RoadScaleConfig
 from birdslam.odometry.road.moving_median import MovingMedianScale
 from birdslam.odometry.road.scale import RoadScale
+from birdslam.odometry.scale_config import RoadScaleConfig
 from birdslam.runtime.configuration import ConfigurationError, load
 from birdslam.types import Status
 

@@ -11,7 +11,8 @@ from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import Pose, rotation_exp
 from birdslam.odometry.road.alignment import RoadAlignConfig, RoadAligner
 from birdslam.odometry.road.fit import RoadFit
-from birdslam.odometry.road.kalman_filter import RoadFilter, RoadScaleConfig
+from birdslam.odometry.road.kalman_filter import RoadFilter
+from birdslam.odometry.scale_config import RoadScaleConfig
 from birdslam.perf.accuracy.graded_road import CURVE_M, GradedRoad, Stand
 
 CAMERA = Camera(931, 282, 540.0, 540.0, 456.3, 139.2, height_m=1.65)

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera, plane_normal
 from birdslam.geometry.pose import rotation_exp
-from birdslam.odometry.road.kalman_filter import RoadFilter, RoadScaleConfig
+from birdslam.odometry.road.kalman_filter import RoadFilter
 from birdslam.odometry.road.vanishing_point import VanishingPointConfig, VanishingPointDetector, vanishing_point
+from birdslam.odometry.scale_config import RoadScaleConfig
 
 CAMERA = Camera(640, 192, 371.2, 371.2, 319.5, 90.0, height_m=1.65)
 CONFIG = VanishingPointConfig()

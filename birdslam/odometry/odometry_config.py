@@ -12,7 +12,7 @@ from birdslam.odometry.corners.initialisation import InitialisationConfig
 from birdslam.odometry.corners.keyframes import KeyframeConfig
 from birdslam.odometry.motion import MotionConfig
 from birdslam.odometry.obstruction.fixed_corners import FixedCornersConfig
-from birdslam.odometry.road.kalman_filter import RoadScaleConfig
+from birdslam.odometry.scale_config import RoadScaleConfig
 from birdslam.odometry.speed.constant_velocity import ConstantVelocityConfig
 from birdslam.odometry.speed.stillness import StillnessConfig
 from birdslam.odometry.speed.zero_velocity import ZeroVelocityConfig

@@ -26,7 +26,7 @@ from birdslam.geometry import bev
 from birdslam.geometry.arrays import Floats, Image
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.pose import rotation_exp
-from birdslam.odometry.road.kalman_filter import RoadScaleConfig
+from birdslam.odometry.scale_config import RoadScaleConfig
 from birdslam.outputs.drive_files import claim_directory
 from birdslam.perception import Perception, Ready
 from birdslam.perf.accuracy.drives import with_networks

@@ -19,9 +19,9 @@ from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.pose import Pose
 from birdslam.odometry.metric_scale import RoadView
 from birdslam.odometry.road.fit import RoadFit
-from birdslam.odometry.road.kalman_filter import RoadScaleConfig
 from birdslam.odometry.road.points import on_road
 from birdslam.odometry.road.vanishing_point import VanishingPoint
+from birdslam.odometry.scale_config import RoadScaleConfig
 from birdslam.types import SpeedReading, SpeedSource, Status
 
 Floats = NDArray[np.float64]

@@ -22,13 +22,14 @@ from birdslam.odometry.obstruction.bonnet import Bonnet
 from birdslam.odometry.obstruction.fixed_pattern import FixedPattern
 from birdslam.odometry.road.alignment import RoadAligner
 from birdslam.odometry.road.fit import RoadFit
-from birdslam.odometry.road.kalman_filter import RoadFilter, RoadScaleConfig
+from birdslam.odometry.road.kalman_filter import RoadFilter
 from birdslam.odometry.road.keyframe_images import RoadFrame, RoadKeyframe, RoadKeyframes
 from birdslam.odometry.road.mount_change import MountChangeDetector
 from birdslam.odometry.road.road_image import RoadImage
 from birdslam.odometry.road.scale_confirmation import TOLD, ScaleConfirmation
 from birdslam.odometry.road.scale_search import LengthSearch, agrees, best_alignment, scale_from_landmarks
 from birdslam.odometry.road.vanishing_point import VanishingPoint, VanishingPointDetector
+from birdslam.odometry.scale_config import RoadScaleConfig
 from birdslam.odometry.speed.scale import CarMotion, SpeedScale
 from birdslam.types import SpeedReading, SpeedSource, Status
 

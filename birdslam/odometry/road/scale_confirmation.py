@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from birdslam.odometry.road.kalman_filter import RoadScaleConfig
+from birdslam.odometry.scale_config import RoadScaleConfig
 
 TOLD = 0.5  # of an alignment's information about the length (kalman_filter.py): with more it counts as told
 _COMPARISONS = 5  # time constant of the mean of what they tell

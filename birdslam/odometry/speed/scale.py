@@ -15,7 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from birdslam.odometry.road.kalman_filter import CAR_DELAY, CAR_FACTOR, RoadFilter, RoadScaleConfig
+from birdslam.odometry.road.kalman_filter import CAR_DELAY, CAR_FACTOR, RoadFilter
+from birdslam.odometry.scale_config import RoadScaleConfig
 from birdslam.odometry.speed.readings import CarSpeedConfig, SpeedReadings
 from birdslam.types import NS_PER_S, SpeedReading, Status
 
