@@ -8,7 +8,6 @@ combination of scale, pitch, roll and curvature, and the filter knows which.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,13 +17,12 @@ from birdslam.geometry.pose import Pose
 from birdslam.odometry.corners.sliding_window import SlidingWindow
 from birdslam.odometry.metric_scale import RoadView
 from birdslam.odometry.motion import planar
-from birdslam.odometry.obstruction.bonnet import Bonnet
-from birdslam.odometry.obstruction.fixed_pattern import FixedPattern
 from birdslam.odometry.road.alignment import RoadAligner
 from birdslam.odometry.road.fit import RoadFit
 from birdslam.odometry.road.kalman_filter import RoadFilter
 from birdslam.odometry.road.keyframe_images import RoadFrame, RoadKeyframe, RoadKeyframes
 from birdslam.odometry.road.mount_change import MountChangeDetector
+from birdslam.odometry.road.obstructions import RoadObstructions
 from birdslam.odometry.road.road_image import RoadImage
 from birdslam.odometry.road.scale_confirmation import TOLD, ScaleConfirmation
 from birdslam.odometry.road.scale_search import LengthSearch, agrees, best_alignment, scale_from_landmarks
@@ -37,7 +35,6 @@ _MIN_STEP_M = 0.1  # of a motion whose rotation gives the curvature of the path
 # The share of the least correlation that suffices where the landmarks agree, whose errors are independent, or where
 # other lengths are far less likely: on a rendered motorway behind a coarse encoder correlations reach 0.2
 _AGREED_CORRELATION_SHARE = 0.5
-_MOVING_PX = 3.0  # flow of what is below the horizon, from one image to the next
 _MAX_BEND_PER_M = 0.2  # no car turns more tightly
 
 
@@ -54,8 +51,7 @@ class RoadScale:
         self._filter = RoadFilter(camera, config)
         self._car = SpeedScale(config, self._filter)
         self._mount_change = MountChangeDetector(camera, config.mount_change)
-        self._fixed_pattern = FixedPattern(config.fixed_pattern)
-        self._bonnet = Bonnet(config.bonnet)
+        self._obstructions = RoadObstructions(self._aligner, config)
         self._vanishing_points = VanishingPointDetector(camera, config.vanishing_point)
         self._keyframes = RoadKeyframes(config.keyframes)
         self._confirmation = ScaleConfirmation(config)
@@ -71,8 +67,7 @@ class RoadScale:
     @property
     def bonnet_px(self) -> NDArray[np.float64] | None:
         """(W, 2) the upper edge of the car's own bonnet in the image; None: none is seen."""
-        rows = self._bonnet.rows
-        return None if rows is None else np.column_stack([np.arange(len(rows)), rows]).astype(np.float64)
+        return self._obstructions.bonnet_px
 
     @property
     def ground(self) -> GroundPlane:
@@ -86,7 +81,7 @@ class RoadScale:
 
         What is on the glass bends and blurs the road's image the same way in each, so that its error is in no mean.
         """
-        lasting = self.config.sigma_on_glass_rel if self._on_glass or self._fixed_pattern.present else 0.0
+        lasting = self.config.sigma_on_glass_rel if self._on_glass or self._obstructions.fixed_pattern else 0.0
         return float(np.hypot(np.sqrt(self._filter.cov[0, 0]), lasting))
 
     @property
@@ -102,10 +97,9 @@ class RoadScale:
     def restart(self, grey: NDArray[np.uint8], pose: Pose, sigma_rel: float) -> None:
         """The window begins anew with this image; its unit of length is known to `sigma_rel`."""
         image = self._aligner.image(grey)
-        if not self._bonnet.initialised:
-            self._bonnet.update(grey, self._aligner.top_px, np.inf)
+        self._obstructions.begin(grey)
         self._keyframes.clear()
-        if not self._fixed_pattern.present:
+        if not self._obstructions.fixed_pattern:
             self._keyframes.insert(RoadFrame(image, image), pose, 0.0)
         if not self._confirmation.begun:
             sigma_rel = 1.0
@@ -163,7 +157,7 @@ class RoadScale:
         self._since_m += travelled_m
 
         self._update_bonnet(view, travelled_m)
-        frame, pose = self._frame(view.grey), view.pose
+        frame, pose = self._obstructions.frame(view.grey), view.pose
         factor = float(np.exp(np.clip(self._filter.pending_log, -0.1, 0.1)))
         self._filter.pending_log = 0.0
         keyframe = self._keyframe(pose)
@@ -172,12 +166,13 @@ class RoadScale:
             if not self._was_known and not self._confirmation.begun and self.unknown:
                 self._filter.initialise_pitch(T.R.T @ T.p, view.sigma_across_m)
             bend_per_m = _bend_per_m(step.R, travelled_m)
-            wide = self._fixed_pattern.present
+            wide = self._obstructions.fixed_pattern
             px = self._aligner.samples(self._tilt, view.boxes_px, view.road_mask, bend_per_m, wide)
-            px = self._bonnet.above(px)
+            px = self._obstructions.above_bonnet(px)
             if len(px) >= self.config.align.min_samples:
                 unit = self._landmark_scale(view.window)
-                if self._fixed_pattern_changed(keyframe, frame, px, T, unit or factor, view):
+                T_m, road = Pose(T.R, T.p * (unit or factor)), self._filter.prediction[0]
+                if self._obstructions.pattern_changed(keyframe, frame, px, T_m, road, view.flow_px):
                     self._keyframes.clear()  # they are corrected for a pattern, or are not, unlike those to come
                     return factor
                 by_landmarks = None if unit is None else unit / factor
@@ -189,26 +184,6 @@ class RoadScale:
         self._mount_change.update(self._filter.tilt, factor * travelled_m, measured)
         self._insert_keyframe(frame, pose, factor)
         return factor
-
-    def _frame(self, grey: NDArray[np.uint8]) -> RoadFrame:
-        """The present image, corrected for a fixed pattern where there is one."""
-        raw, top_px = self._aligner.image(grey), self._aligner.top_px
-        self._fixed_pattern.update_mean(grey, top_px)
-        if not self._fixed_pattern.present:
-            return RoadFrame(raw, raw)
-        return RoadFrame(raw, RoadImage.of(self._fixed_pattern.subtract(grey, top_px), top_px))
-
-    def _fixed_pattern_changed(
-        self, keyframe: RoadKeyframe, frame: RoadFrame, px: NDArray[np.int64], T: Pose, unit_m: float, view: RoadView
-    ) -> bool:
-        """Whether a fixed pattern has appeared or gone; T_keyframe_present times `unit_m` is in metres."""
-        baseline_m = float(np.linalg.norm(T.p)) * unit_m
-        driven_m = baseline_m if view.flow_px < _MOVING_PX else np.inf
-        warp = None
-        if baseline_m >= self.config.fixed_pattern.min_baseline_m:  # a shorter motion warps an image onto itself
-            road = np.append(0.0, self._filter.prediction[0][1:])
-            warp = partial(self._aligner.warp, keyframe.raw, Pose(T.R, T.p * unit_m), px, road)
-        return self._fixed_pattern.detect(keyframe.raw, frame.raw, px, driven_m, warp)
 
     def _update_vanishing_point(self, step: Pose, view: RoadView, travelled_m: float) -> None:
         """The tilt by the vanishing point of the road's lines, where there is one ahead."""
@@ -229,12 +204,8 @@ class RoadScale:
 
     def _update_bonnet(self, view: RoadView, travelled_m: float) -> None:
         """Where a bonnet has been taken for road until it was found, scale and tilt are dropped."""
-        driven_m = travelled_m
-        if not self._confirmation.begun:  # the length is not known: optical flow tells whether the car has moved
-            if view.flow_px < _MOVING_PX:
-                return
-            driven_m = np.inf
-        if self._bonnet.update(view.grey, self._aligner.top_px, driven_m):
+        driven_m = travelled_m if self._confirmation.begun else None
+        if self._obstructions.bonnet_changed(view.grey, driven_m, view.flow_px):
             self._filter.reset_scale(1.0)
             self._filter.lose_tilt()
             self._confirmation.forget()
@@ -279,7 +250,7 @@ class RoadScale:
             out.append(Status.SCALE_INVALID)
         if self._confirmation.violated:
             out.append(Status.GROUND_VIOLATED)
-        if self._fixed_pattern.present or self._bonnet.present:
+        if self._obstructions.present:
             out.append(Status.VIEW_OBSTRUCTED)
         if self._mount_change.drifted:
             out.append(Status.CALIBRATION_DRIFT)

@@ -1,0 +1,90 @@
+"""What stands before the road in the image: a pattern fixed to the glass, and the car's own bonnet."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.pose import Pose
+from birdslam.odometry.obstruction.bonnet import Bonnet
+from birdslam.odometry.obstruction.fixed_pattern import FixedPattern
+from birdslam.odometry.road.alignment import RoadAligner
+from birdslam.odometry.road.keyframe_images import RoadFrame
+from birdslam.odometry.road.road_image import RoadImage
+from birdslam.odometry.scale_config import RoadScaleConfig
+
+_MOVING_PX = 3.0  # flow of what is below the horizon, from one image to the next
+
+
+class RoadObstructions:
+    """State: the fixed pattern and the bonnet, as the images so far show them. Reader: `RoadScale`."""
+
+    def __init__(self, aligner: RoadAligner, config: RoadScaleConfig) -> None:
+        self._aligner = aligner
+        self._min_baseline_m = config.fixed_pattern.min_baseline_m
+        self._fixed_pattern = FixedPattern(config.fixed_pattern)
+        self._bonnet = Bonnet(config.bonnet)
+
+    @property
+    def bonnet_px(self) -> NDArray[np.float64] | None:
+        """(W, 2) the upper edge of the car's own bonnet in the image; None: none is seen."""
+        rows = self._bonnet.rows
+        return None if rows is None else np.column_stack([np.arange(len(rows)), rows]).astype(np.float64)
+
+    @property
+    def fixed_pattern(self) -> bool:
+        """Whether the road's image has a pattern that stays while the car drives."""
+        return self._fixed_pattern.present
+
+    @property
+    def present(self) -> bool:
+        """Whether anything stands before the road."""
+        return self._fixed_pattern.present or self._bonnet.present
+
+    def begin(self, grey: NDArray[np.uint8]) -> None:
+        """Looks for a bonnet in the first image."""
+        if not self._bonnet.initialised:
+            self._bonnet.update(grey, self._aligner.top_px, np.inf)
+
+    def frame(self, grey: NDArray[np.uint8]) -> RoadFrame:
+        """The present image, corrected for a fixed pattern where there is one."""
+        raw, top_px = self._aligner.image(grey), self._aligner.top_px
+        self._fixed_pattern.update_mean(grey, top_px)
+        if not self._fixed_pattern.present:
+            return RoadFrame(raw, raw)
+        return RoadFrame(raw, RoadImage.of(self._fixed_pattern.subtract(grey, top_px), top_px))
+
+    def pattern_changed(
+        self,
+        keyframe: RoadFrame,
+        frame: RoadFrame,
+        px: NDArray[np.int64],
+        T_m: Pose,
+        road: NDArray[np.float64],
+        flow_px: float,
+    ) -> bool:
+        """Whether a fixed pattern has appeared or gone.
+
+        `T_m` is T_keyframe_present in metres, `road` (4,) the predicted measurement of an alignment, `flow_px` that of
+        what is below the horizon.
+        """
+        baseline_m = float(np.linalg.norm(T_m.p))
+        driven_m = baseline_m if flow_px < _MOVING_PX else np.inf
+        warp = None
+        if baseline_m >= self._min_baseline_m:  # a shorter motion warps an image onto itself
+            warp = partial(self._aligner.warp, keyframe.raw, T_m, px, np.append(0.0, road[1:]))
+        return self._fixed_pattern.detect(keyframe.raw, frame.raw, px, driven_m, warp)
+
+    def bonnet_changed(self, grey: NDArray[np.uint8], driven_m: float | None, flow_px: float) -> bool:
+        """Whether a bonnet was found or is gone. `driven_m` None: the length is not known, flow tells a motion."""
+        if driven_m is None:
+            if flow_px < _MOVING_PX:
+                return False
+            driven_m = np.inf
+        return self._bonnet.update(grey, self._aligner.top_px, driven_m)
+
+    def above_bonnet(self, px: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Those of the pixels (N, 2) that the bonnet does not cover."""
+        return self._bonnet.above(px)
