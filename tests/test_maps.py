@@ -30,6 +30,7 @@ from birdslam.outputs.map_trajectory import MapTrajectory, TrajectoryFiles
 from birdslam.runtime.batch.one_map import DRIVE_MAP, join
 from birdslam.runtime.cli.commands import parse
 from birdslam.runtime.configuration import ConfigurationError, load
+from birdslam.runtime.maps import map_drive
 from birdslam.runtime.maps.map_drive import MapChoice
 from birdslam.runtime.maps.map_store import read_map, write_map
 from birdslam.types import Attitude
@@ -539,3 +540,18 @@ def test_the_commands(files: dict[str, Path], tmp_path: Path, capsys: pytest.Cap
     options = parse(["map", "export", own, "--output", str(tmp_path / "map.kml")])
     with pytest.raises(MapError, match="not on Earth"):
         options.call(options)
+
+
+def test_what_is_kept_of_a_long_drive_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(map_drive, "MOST_POSES", 16)
+    driving = map_drive.MapDrive(MapChoice(tmp_path / "new.map", extend=True), CAMERA, tmp_path)
+    estimates = [estimate for estimate, _, _ in drive(STREET, range(100), 3)]
+    for estimate in estimates:
+        driving.step(estimate, None)
+    driving.end()
+    places = driving.places
+    assert 8 <= len(places) <= 16
+    ways = [place.T_map_ego.x_m for place in places]
+    assert ways[0] == 0.0
+    assert max(np.diff(ways)) < 12.0
+    assert abs(ways[-1] - estimates[-1].T_world_ego.x_m) < 9.0

@@ -1,15 +1,17 @@
 """The same road twice: recall and false loops of places, errors of localisation, what closing a loop brings.
 
-    python -m perf loops [--output FILE.json] [--part recorded|town|loop|alike|gnss|size ...]
+    python -m perf loops [--output FILE.json] [--part recorded|town|loop|alike|scale|gnss|size ...]
 
 `recorded`: two passes of one KITTI street in each other's map, three other streets against both. `town`: rendered once
 into --drives (extra `train`), driven twice, then otherwise. `loop`: corners without images, twice. `alike`: equal
-houses: each loop is false. `gnss`: fixes, with a jump of 15 m. `size`: simulated descriptors of 1, 10, 100 km.
+houses: each loop is false. `scale`: a unit of length that drifts. `gnss`: fixes that jump. `size`: simulated
+descriptors of 1, 10, 100 km.
 """
 
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,14 +23,14 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
-from birdslam.loops.features import FeatureExtractor, FeatureKind
+from birdslam.loops.features import FeatureExtractor, FeatureKind, Features
 from birdslam.loops.localiser import Localisation
 from birdslam.loops.map_file import decode_map, encode_map
 from birdslam.loops.map_pose import MapState
 from birdslam.loops.place_map import MapCamera, PlaceMap
 from birdslam.loops.session import MapSession
 from birdslam.outputs.map_trajectory import MapTrajectory
-from birdslam.perf.maps import simulated, town
+from birdslam.perf.maps import scale_drift, simulated, town
 from birdslam.perf.reporting.arguments import add_data, benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
 from birdslam.runtime.batch.offline import pipeline
@@ -38,7 +40,7 @@ from birdslam.types import Estimate
 
 label = "places found again, poses in a kept map, loops closed; a map's size and look-up time"
 
-PARTS = "recorded", "town", "loop", "alike", "gnss", "size"
+PARTS = "recorded", "town", "loop", "alike", "scale", "gnss", "size"
 BASE_M = 0.537  # between the cameras of the two passes
 OTHERS = ("kitti_odometry/sequences/00", "kitti_odometry/sequences/06", "kitti_tracking/training/image_03/0005")
 
@@ -64,6 +66,8 @@ def run(arguments: list[str]) -> None:
             simulated.loop(ledger, options.way)
         if "alike" in options.part:
             simulated.alike(ledger, options.equal_houses)
+        if "scale" in options.part:
+            scale_drift.measure(ledger)
         if "gnss" in options.part:
             simulated.gnss(ledger, options.way)
         if "size" in options.part:
@@ -94,10 +98,12 @@ def recorded(ledger: Ledger, data: Path, kinds: Sequence[FeatureKind]) -> None:
     for kind in kinds:
         for name, other, side in (("left", "right", -1.0), ("right", "left", 1.0)):
             camera, frames = passes[name]
-            kept = encode_map(mapped(camera, frames, kind))
+            extract = TimedExtractor(kind)
+            kept = encode_map(mapped(camera, frames, extract))
             found = localised(*passes[other], kept, kind)
             truth = [estimate.T_world_ego @ SE2(0.0, side * BASE_M, 0.0) for estimate, _ in frames]
             row = judged(found, truth) | {"MB_a_km": round(len(kept) / 1e3 / max(decode_map(kept).length_m, 1.0), 2)}
+            row["features_ms"] = round(float(np.median(extract.took_ms)), 1)
             ledger.add(f"{kind}: {other} in the map of {name}", row_text(row), **row, text=row_text(row))
             for street, (street_camera, drive) in others.items():
                 states = localised(street_camera, drive, kept, kind).poses
@@ -106,10 +112,24 @@ def recorded(ledger: Ledger, data: Path, kinds: Sequence[FeatureKind]) -> None:
                 ledger.add(title, text, false=len(states), frames=len(drive), text=text)
 
 
-def mapped(camera: Camera, frames: Iterable[Seen], kind: FeatureKind) -> PlaceMap:
+class TimedExtractor(FeatureExtractor):
+    """Knows how long each image took, in milliseconds of a core."""
+
+    def __init__(self, kind: FeatureKind) -> None:
+        super().__init__(kind)
+        self.took_ms: list[float] = []
+
+    def __call__(self, image: NDArray[np.uint8]) -> Features:
+        begun_s = time.process_time()
+        out = super().__call__(image)
+        self.took_ms.append(1e3 * (time.process_time() - begun_s))
+        return out
+
+
+def mapped(camera: Camera, frames: Iterable[Seen], extract: FeatureExtractor) -> PlaceMap:
     """The map of a drive."""
     place_map = PlaceMap(MapCamera.of(camera))
-    session = MapSession(camera, place_map, True, FeatureExtractor(kind))
+    session = MapSession(camera, place_map, True, extract)
     for estimate, image in frames:
         session.step(estimate, image)
     session.finish()
@@ -160,6 +180,7 @@ def row_text(row: dict[str, Any]) -> str:
         return f"0 of {row['frames']} localised"
     x, y, yaw = row["within_2_sigma"]
     size = f", {row['MB_a_km']} MB a km" if "MB_a_km" in row else ""
+    size += f", features of an image in {row['features_ms']:.0f} ms" if "features_ms" in row else ""
     return (
         f"{row['localised']} of {row['frames']} localised (first as frame {row['frames_to_localise']}), "
         f"median {row['median_m']:.3f} m {row['median_deg']:.3f} deg, worst {row['worst_m']:.3f} m, "

@@ -26,6 +26,7 @@ from birdslam.runtime.maps.map_store import check_map, write_map
 from birdslam.types import NS_PER_S, Estimate
 
 POSE_EVERY_M = 1.0  # of way: what is kept of a drive for its place on Earth
+MOST_POSES = 20_000  # of them; a longer drive keeps every second one, and so on
 
 Poses = list[tuple[int, SE2]]  # source time in ns, and the pose in one frame
 HELD_M = 30.0  # a pose moves with the keyframe that is so near
@@ -79,7 +80,8 @@ class MapDrive:
     def __init__(self, choice: MapChoice, camera: Camera, output: Path) -> None:
         """Raises MapError, ConfigurationError, OSError."""
         self.map = choice.open(camera)
-        self._way: list[_Held] = []  # every metre
+        self._way: list[_Held] = []  # every metre, or every two and so on
+        self._every_m = POSE_EVERY_M
         self._last: SE2 | None = None  # of them, in the map
         self._choice = choice
         self._before = self._saved = len(self.map)
@@ -113,10 +115,13 @@ class MapDrive:
         number = None if keyframe is None else keyframe.number
         held = _Held(estimate.t_source_ns, estimate.epoch, estimate.T_world_ego, number, T_keyframe_ego)
         self._way.append(held)
+        if len(self._way) > MOST_POSES:
+            self._way = self._way[::2]
+            self._every_m *= 2.0
 
     @property
     def places(self) -> list[Place]:
-        """The drive's way, every metre, as the map's keyframes lie now."""
+        """The drive's way, every metre or so, as the map's keyframes lie now."""
         at = {keyframe.number: keyframe.T_map_keyframe for keyframe in self.map.keyframes}
         return [
             Place(
@@ -135,7 +140,7 @@ class MapDrive:
 
     def _is_further(self, T_map_ego: SE2) -> bool:
         last = self._last
-        return last is None or math.hypot(T_map_ego.x_m - last.x_m, T_map_ego.y_m - last.y_m) >= POSE_EVERY_M
+        return last is None or math.hypot(T_map_ego.x_m - last.x_m, T_map_ego.y_m - last.y_m) >= self._every_m
 
     @property
     def T_map_odom(self) -> SE2 | None:
