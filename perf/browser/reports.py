@@ -92,6 +92,9 @@ def faults(seen: Seen, way: str) -> Iterator[str]:
         yield f"the slider moves nothing: from {said['from']} to {said['to']}"
     if said.get("film") == "false":
         yield "the film does not follow the slider"
+    if "over" not in said:
+        yield "is no page that ends as one: nothing could be asked of it"
+        return
     if float(said["over"]) > 0.0:
         yield f"stands out to the right by {said['over']} px"
     bright = sum(int(part) for part in said["ground"].removeprefix("rgb(").rstrip(")").split(",")[:3])

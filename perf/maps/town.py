@@ -196,7 +196,7 @@ def _kidnapped(
     # As soon as the other drive's odometry is valid
     after = [pair for pair in seen[other] if pair[0].valid]
     T_odom = seen[name][cut - 1][0].T_world_ego @ after[0][0].T_world_ego.inverse()
-    wrong_m = recovered_m = float("nan")
+    wrong_m, recovered_m = 0.0, float("nan")
     way_m, T_last = 0.0, then.truth[after[0][0].frame_id]
     for estimate, image in after:
         moved = msgspec.structs.replace(

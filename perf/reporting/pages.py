@@ -162,7 +162,7 @@ PAGES: tuple[Derived | Page, ...] = (
     Page(
         "loops",
         (
-            "python -m birdslam.perf loops --part recorded loop alike gnss size --equal-houses 1000 "
+            "python -m birdslam.perf loops --part recorded loop alike scale gnss size --equal-houses 1000 "
             "--data {data} --output {out}/loops.json",
         ),
         {"docs/loops.md": ("loops.json", loops.page)},

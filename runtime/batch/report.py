@@ -41,11 +41,11 @@ PLOTS = (
     ("ate_m", "ATE (m), where truth is there"),
 )
 STYLE = (
-    ":root{color-scheme:light dark}body{font:15px sans-serif;margin:2em}table{"
+    ":root{color-scheme:light dark}body{font:15px sans-serif;margin:2em;background:Canvas}table{"
     "border-collapse:collapse;margin:1em 0}"
     "td,th{padding:.25em .7em;border-bottom:1px solid #8888;text-align:right}"
     "td:first-child,th:first-child{text-align:left}"
-    ".failed{color:#d1342f;text-align:left}img{max-width:100%;background:#fff}a{color:inherit}"
+    ".wide{overflow-x:auto}.failed{color:#d1342f;text-align:left}img{max-width:100%;background:#fff}a{color:inherit}"
 )
 
 Outcome = DriveResult | Failure
@@ -166,8 +166,9 @@ def _plot(names: list[str], numbers: np.ndarray, statuses: Counter[str], path: P
 
 
 def _write_page(file: IO[str], tasks: Sequence[Task], output: Path) -> None:
-    head = '<!doctype html><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
-    file.write(f"{head}<title>BirdSLAM: drives</title><style>{STYLE}</style>\n")
+    head = '<!doctype html><html lang="en"><meta charset="utf-8">'
+    wide = '<meta name="viewport" content="width=device-width, initial-scale=1">'
+    file.write(f"{head}{wide}<title>BirdSLAM: drives</title><style>{STYLE}</style>\n<body>")
     file.write('<h1>Drives</h1>\n<p><img src="report.png" alt="plots"></p>\n')
     if any(task.settings for task in tasks):
         _write_sweep(file, tasks, output)
@@ -185,7 +186,7 @@ def _write_page(file: IO[str], tasks: Sequence[Task], output: Path) -> None:
         "scale error",
         "statuses",
     )
-    file.write("<table><tr>" + "".join(f"<th>{head}</th>" for head in heads) + "</tr>\n")
+    file.write('<div class="wide"><table><tr>' + "".join(f"<th>{head}</th>" for head in heads) + "</tr>\n")
     for outcome in outcomes(tasks, output):
         name = html.escape(outcome.drive)
         if isinstance(outcome, Failure):
@@ -200,7 +201,7 @@ def _write_page(file: IO[str], tasks: Sequence[Task], output: Path) -> None:
         page = REPORT if (output / DRIVES / outcome.drive / REPORT).is_file() else "bev.png"
         link = f'<a href="{DRIVES}/{name}/{page}">{name}</a>'
         file.write(f"<tr><td>{link}</td>" + "".join(f"<td>{_text(cell)}</td>" for cell in cells) + "</tr>\n")
-    file.write("</table>\n")
+    file.write("</table></div>\n</body></html>\n")
 
 
 def _write_sweep(file: IO[str], tasks: Sequence[Task], output: Path) -> None:
