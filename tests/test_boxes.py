@@ -44,6 +44,7 @@ def test_every_difference_counts() -> None:
     assert boxes.differences({}, found) == 3
 
 
+@pytest.mark.slow  # three drives
 @pytest.mark.processes
 def test_both_libraries_give_what_the_file_gives(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -191,6 +191,7 @@ def test_a_browser_draws_it_and_the_slider_moves(results: Path, tmp_path: Path, 
     assert picture.std() > 5.0
 
 
+@pytest.mark.slow  # three browsers
 @pytest.mark.skipif(chromium() is None, reason="no Chromium (Debian: apt install chromium)")
 def test_what_is_wrong_with_a_page_is_told(results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = report(results)
