@@ -16,7 +16,9 @@ const worker = new Worker("worker.js");
 worker.addEventListener("message", ({data}) => document.documentElement.dataset.heard = JSON.stringify(data));
 worker.postMessage({type: 0, words: ["one", "two"]});
 </script></body></html>"""
-WORKER = """addEventListener("message", async ({data}) => postMessage({words: data.words.length, inFrame: self !== parent}))"""
+WORKER = """addEventListener("message", async ({data}) => {
+  postMessage({words: data.words.length, inFrame: self !== parent});
+});"""
 
 
 @pytest.mark.slow
