@@ -4,10 +4,7 @@
 
 Further options are those of `birdslam run`; without `--source` the software camera of the fault suite drives down its
 street. Ends with status 1, and says why, where after the first minute a process grew by more than 1 % or held more
-descriptors, was restarted or missed a watchdog (the soak stands in systemd's place), or estimates came later. A
-recording that goes round is a new street to the map each time, since the car is elsewhere at once: what its new
-keyframes hold is no growth of the process. With `--set results.map_only=FILE` in place of `--map` the map does
-not grow. A `--rate` above the recording's own drives faster than real time; frames that are too many are dropped.
+descriptors, was restarted or missed a watchdog (the soak stands in systemd's place), or estimates came later.
 """
 
 from __future__ import annotations
@@ -181,7 +178,10 @@ def ages(found: Ages) -> tuple[str, list[str]]:
 
 
 def keyframes_in(file: Path) -> int:
-    """Of the map as it was last saved."""
+    """Of the map as it was last saved.
+
+    A recording that goes round is a new street to it each time, since the car is elsewhere at once.
+    """
     try:
         return len(read_map(file))
     except MapError:  # none was saved yet
@@ -258,7 +258,7 @@ def run(arguments: list[str]) -> int:
     """Gives the exit status."""
     parser = benchmark_parser("soak", label, output="")
     parser.add_argument("--minutes", type=float, default=30.0)
-    parser.add_argument("--rate", type=float, default=33.0, metavar="HZ")
+    parser.add_argument("--rate", type=float, default=33.0, metavar="HZ", help="above the recording's: faster")
     parser.add_argument("--source", default="", metavar="URI", help="goes round and round; left out: a software camera")
     parser.add_argument("--map", action="store_true", help="localised in a map that it makes")
     parser.add_argument("--record", action="store_true", help="with a recorder beside it")
