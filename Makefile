@@ -1,5 +1,6 @@
 # Everything runs in the project's own virtual environment; the only needs are Python 3.11 and make.
 PYTHON ?= python3
+PYTHONS := 3.11 3.12 3.13
 VENV := .venv
 BIN := $(VENV)/bin
 TRAIN_VENV := .venv-train
@@ -13,7 +14,7 @@ CORES := $(or $(shell nproc 2>/dev/null),2)
 unexport PYTHONDONTWRITEBYTECODE
 ON_EACH_CHANGE := not slow and not faults and not onroad
 
-.PHONY: setup browser test test-slow wheel-test index-test pages wheels fuzz faults onroad perf lint train demo demo-kitti clean
+.PHONY: setup browser test test-slow pythons wheel-test index-test pages wheels fuzz faults onroad perf lint train demo demo-kitti clean
 
 setup: $(VENV)/.ready
 
@@ -41,6 +42,13 @@ test: browser setup
 test-slow: setup
 	$(BIN)/python -m pytest -m slow
 	$(BIN)/python -m pytest -n $(CORES) --dist worksteal -m 'hypothesis and $(ON_EACH_CHANGE)' --hypothesis-profile=explore
+
+# The demo and the tests on each Python that answers here, each in an environment of its own
+pythons:
+	@for version in $(PYTHONS); do \
+		python$$version -c '' 2>/dev/null || { echo "no Python $$version here"; continue; }; \
+		$(MAKE) --no-print-directory demo test PYTHON=python$$version VENV=.venv-$$version || exit 1; \
+	done
 
 # What a user installs: the wheel in an empty environment, without the checkout
 wheel-test: setup
@@ -122,4 +130,4 @@ demo-kitti: setup
 		--model segmenter=$(MODELS)/twinlitenet_640x360.onnx --output out/00
 
 clean:
-	rm -rf $(VENV) $(TRAIN_VENV) $(SITE_VENV) $(DIST_VENV) out build *.egg-info
+	rm -rf $(VENV) $(TRAIN_VENV) $(SITE_VENV) $(DIST_VENV) $(PYTHONS:%=.venv-%) out build *.egg-info

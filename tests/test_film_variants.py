@@ -84,7 +84,7 @@ def test_a_truth_whose_every_third_step_is_too_long_makes_no_rate_another_one() 
         course = Course()
         for k in range(every, 61, every):
             true = sum(1.2 if step % 3 == 0 else 0.9 for step in range(k - every, k))
-            course.add(0.1 * k, 0.1 * every, 10.0, 10.0 * true / every, valid=k > 5)
+            course.add(0.1 * k, 0.1 * every, 10.0, 10.0 * true / every, valid=k > 5, sigma_rel=0.02)
         courses.append(summary(course))
     ratio = over(courses[1], courses[0])
     assert ratio is not None
@@ -94,11 +94,20 @@ def test_a_truth_whose_every_third_step_is_too_long_makes_no_rate_another_one() 
 
 
 def test_a_run_is_read_from_what_it_left(tmp_path: Path) -> None:
-    rows = [f"{k},{0.1 * k:.3f},{'' if k == 0 else 5.0},{int(k > 2)}" for k in range(41)]
-    (tmp_path / "frames.csv").write_text("\n".join(["frame,t_s,speed_mps,valid", *rows]))
-    figures = summary(course_of_run(tmp_path / "frames.csv", lambda begin_s, end_s: 4.0))
+    def status(k: int) -> str:
+        return "standstill view_obstructed" if k == 7 else ""
+
+    rows = [
+        f"{k},{0.1 * k:.3f},{'' if k == 0 else 5.0},{0.1 if k < 21 else 0.2},{int(k > 2)},{status(k)}"
+        for k in range(41)
+    ]
+    (tmp_path / "frames.csv").write_text("\n".join(["frame,t_s,speed_mps,scale_sigma_rel,valid,status", *rows]))
+    figures = summary(course_of_run(tmp_path / "frames.csv", lambda begin_s, end_s: 4.0), (0.0, 4.5))
     assert figures["frames"] == 40
     assert figures["valid_after_2_s"] == 1.0
     assert figures["speed_over_truth"] == pytest.approx(1.25)
     assert figures["by_second"][1] == pytest.approx(1.25)
+    assert figures["beyond_s"] == 2  # log 1.25 is .223: beyond .2, within .4
+    assert figures["standstill"] == 1
+    assert figures["outside"] == 38
     assert "over the unchanged -" in row_text(figures)  # it is the only film

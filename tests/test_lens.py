@@ -8,7 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from birdslam.calibration.lens import CornersOfImage, Lens, self_calibrate
+from birdslam.calibration.lens import CornersOfImage, Lens, focal_by_field_of_view, self_calibrate
+from birdslam.geometry.camera import Camera
+from birdslam.runtime.calibration.given import Given, focal_length_of
 
 SIZE_PX = 1280, 720
 FOCAL_PX = 1000.0
@@ -73,6 +75,25 @@ def test_what_is_known_beforehand_is_kept_where_the_drive_shows_no_more() -> Non
     assert lens.focal_px == pytest.approx(FOCAL_PX, rel=0.03)
     assert lens.focal_sigma_rel == pytest.approx(0.02)
     assert lens.k1 == pytest.approx(-0.2, abs=3.0 * lens.k1_sigma)
+
+
+def test_a_wide_lens_is_about_equidistant() -> None:
+    """Of 120 degrees across a pinhole's focal length is half of the true one."""
+    focal_px = focal_by_field_of_view(SIZE_PX[0], 120.0, fisheye=True)
+    middle = 0.5 * (np.array(SIZE_PX) - 1.0)
+    images = []
+    for corners in drive(0.0, 0.0, focal_px=250.0):  # a pinhole that sees as far
+        u = (corners.px - middle) / 250.0
+        r = np.linalg.norm(u, axis=1, keepdims=True)
+        images.append(CornersOfImage(corners.ids, focal_px * u / r * np.arctan(r) + middle))
+    wide = self_calibrate(images, SIZE_PX, focal_px, 0.08, by_view=True, fisheye=True)
+    assert wide is not None
+    assert wide.fisheye
+    assert wide.k1 == pytest.approx(0.0, abs=3.0 * wide.k1_sigma)
+    assert wide.k1_sigma < 0.1
+    given = focal_length_of(Given(fov_deg=140.0), "video:film.mp4", 960)
+    assert given.fisheye
+    Camera(960, 540, given.px, given.px, 479.5, 269.5, height_m=1.4)  # a pinhole's is refused
 
 
 def test_a_car_that_stands_shows_no_lens() -> None:

@@ -50,6 +50,7 @@ _SIGMA_PX = 0.5  # of a corner, by the same pixels
 _MOST_TURN_RAD = 0.8  # of a window
 _LEAST_TURN_RAD = math.radians(30.0)  # a drive that turns less shows no focal length: of 19 real ones eleven did not
 _FARTHEST = 80.0  # of a corner that begins the adjustment, in baselines of its window
+_WIDEST_RAD = 1.45  # from the axis, of a corner
 _BEGUN = -1.0, 0.0, 1.0  # where the focal length is looked for from, in sigmas of what is known of it
 _ROUGHLY = 1e-4  # how far each is adjusted
 _BLOCKS = 8  # of the windows, for the sigma
@@ -57,6 +58,10 @@ _SHOWN = 0.7  # of the sigma beforehand: a focal length that is known no better 
 # How wide cameras see, across, and 1-sigma of their focal length as a fraction: by judgement
 FIELD_OF_VIEW_DEG = {"dashcam": (75.0, 0.25), "phone": (65.0, 0.1)}
 STATED_SIGMA_REL = 0.03  # of a focal length by a field of view that somebody states
+# A lens that sees farther than this across is no pinhole with some distortion, but about equidistant; by judgement
+WIDE_DEG = 100.0
+# ... of whose focal length it is this: equisolid and stereographic lenses are 4 to 6 % and 8 to 15 % off (110, 140 deg)
+WIDE_SIGMA_REL = 0.08
 LEAST_SIGMA_REL = 0.03  # of the focal length: on 19 real drives the fit's own was up to 26 times too small
 LEAST_SIGMA_K1 = 0.01
 
@@ -65,8 +70,9 @@ LEAST_SIGMA_K1 = 0.01
 class Lens:
     """A lens with square pixels, its principal point in the middle: pixel = focal_px u (1 + k1 |u|^2) + middle.
 
-    `u` are normalised coordinates. `turned_rad` is how far the camera turned within the windows, all together;
-    `focal_shown` whether the drive itself says more of the focal length than was known before.
+    `u` are normalised coordinates; a `fisheye` has the angle from its axis in place of |u|, in u's direction.
+    `turned_rad` is how far the camera turned within the windows, all together; `focal_shown` whether the drive itself
+    says more of the focal length than was known before.
     """
 
     focal_px: float
@@ -77,6 +83,7 @@ class Lens:
     corners: int
     turned_rad: float
     focal_shown: bool
+    fisheye: bool = False
 
 
 @dataclass(frozen=True)
@@ -87,9 +94,10 @@ class CornersOfImage:
     px: Floats
 
 
-def focal_by_field_of_view(width_px: int, degrees: float) -> float:
-    """The focal length in pixels of a lens without distortion that sees so far across."""
-    return 0.5 * width_px / math.tan(0.5 * math.radians(degrees))
+def focal_by_field_of_view(width_px: int, degrees: float, fisheye: bool = False) -> float:
+    """The focal length in pixels of a lens that sees so far across: one without distortion, or an equidistant one."""
+    half_rad = 0.5 * math.radians(degrees)
+    return 0.5 * width_px / (half_rad if fisheye else math.tan(half_rad))
 
 
 def followed_corners(images: Iterable[tuple[NDArray[np.uint8], Floats]], camera: Camera) -> list[CornersOfImage]:
@@ -121,6 +129,7 @@ def self_calibrate(
     focal_px: float,
     focal_sigma_rel: float,
     by_view: bool = False,
+    fisheye: bool = False,
 ) -> Lens | None:
     """The lens that the corners of a drive's raw images show; None where there is too little to see.
 
@@ -134,11 +143,11 @@ def self_calibrate(
         if len(windows) < 2 * _LEAST_WINDOWS:
             windows = _windows(images, middle, step_rad * focal_px)
     sigma_px = _SIGMA_PX * focal_px / _FOCAL_PX
-    begun = _begin(windows, focal_px, 0.0, sigma_px)
+    begun = _begin(windows, focal_px, 0.0, sigma_px, fisheye)
     if begun is None:
         return None
     fitted = adjust(begun)
-    again = _begin(windows, focal_px, fitted.k1, sigma_px)
+    again = _begin(windows, focal_px, fitted.k1, sigma_px, fisheye)
     fitted = fitted if again is None else adjust(again)
     if by_view:
         half = 0.5 * size_px[0] / focal_px
@@ -160,6 +169,7 @@ def self_calibrate(
         corners=len(fitted.px),
         turned_rad=turned_rad,
         focal_shown=shown,
+        fisheye=fisheye,
     )
 
 
@@ -174,7 +184,7 @@ def _with_focal_length(windows: Sequence[_Window], fitted: LensProblem, prior: F
     found = [adjust(problem, prior, _ROUGHLY) for problem in begun]
     best = min(found, key=lambda problem: cost_of(problem, prior))
     # Which corners are outliers was decided with another lens
-    again = _begin(windows, math.exp(best.log_focal), best.k1, best.sigma_px)
+    again = _begin(windows, math.exp(best.log_focal), best.k1, best.sigma_px, best.fisheye)
     return best if again is None else adjust(again, prior)
 
 
@@ -259,22 +269,26 @@ def _common(images: Sequence[CornersOfImage], at: Sequence[int], middle: Floats,
     return _Window(np.array([images[k].px[np.searchsorted(images[k].ids, ids)] - middle for k in at]))
 
 
-def _undistorted(px: Floats, focal_px: float, k1: float) -> Floats:
+def _undistorted(px: Floats, focal_px: float, k1: float, fisheye: bool) -> Floats:
     """(..., 2) normalised coordinates of pixels from the middle, by fixed-point iteration."""
     distorted = px / focal_px
-    out = distorted
+    radius = np.maximum(np.sqrt(np.square(distorted).sum(axis=-1, keepdims=True)), 1e-9)
+    found = radius
     for _ in range(8):
-        out = distorted / np.maximum(1.0 + k1 * np.square(out).sum(axis=-1, keepdims=True), 0.3)
+        found = radius / np.maximum(1.0 + k1 * np.square(found), 0.3)
+    out: Floats = distorted / radius * (np.tan(np.minimum(found, _WIDEST_RAD)) if fisheye else found)
     return out
 
 
-def _begin(windows: Sequence[_Window], focal_px: float, k1: float, sigma_px: float) -> LensProblem | None:
+def _begin(
+    windows: Sequence[_Window], focal_px: float, k1: float, sigma_px: float, fisheye: bool
+) -> LensProblem | None:
     """Poses and corners of each window, by its first and last image and by resection of those between."""
     px, of, corner = [], [], []
     R: list[Floats] = []
     t: list[Floats] = []
     for window in windows:
-        begun = _begin_window(_undistorted(window.px, focal_px, k1))
+        begun = _begin_window(_undistorted(window.px, focal_px, k1, fisheye))
         if begun is None:
             continue
         keep, R_w, t_w, corner_w = begun
@@ -294,6 +308,7 @@ def _begin(windows: Sequence[_Window], focal_px: float, k1: float, sigma_px: flo
         math.log(focal_px),
         k1,
         sigma_px,
+        fisheye,
     )
 
 

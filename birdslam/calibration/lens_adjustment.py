@@ -39,6 +39,7 @@ class LensProblem:
     log_focal: float
     k1: float
     sigma_px: float  # of a corner: a larger image has it in more pixels, whatever its lens turns out to be
+    fisheye: bool = False  # the radius grows with the angle from the axis, and not with its tangent
 
     @property
     def shared(self) -> Floats:
@@ -134,13 +135,27 @@ class _System:
     prior_gradient: Floats  # (2,)
 
 
-def _project(problem: LensProblem) -> tuple[Floats, Floats, Floats, Floats]:
-    """Rays turned into each image (P, I, 3), places q (P, I, 3), normalised coordinates u and distorted d (P, I, 2)."""
+def _project(problem: LensProblem) -> tuple[Floats, Floats, Floats]:
+    """Rays turned into each image (P, I, 3), places q (P, I, 3), and normalised coordinates u (P, I, 2)."""
     rays = np.concatenate([problem.corner[:, :2], np.ones((len(problem.corner), 1))], axis=1)
     turned = np.einsum("pikl,pl->pik", problem.R[problem.of], rays)
     q = turned + problem.corner[:, 2, None, None] * problem.t[problem.of]
     u = q[..., :2] / np.maximum(q[..., 2:], _NEAREST)
-    return turned, q, u, u * (1.0 + problem.k1 * np.square(u).sum(axis=-1, keepdims=True))
+    return turned, q, u
+
+
+def _distorted(problem: LensProblem, u: Floats) -> tuple[Floats, Floats, Floats]:
+    """d (..., 2), what the lens makes of normalised coordinates u (..., 2), and how it goes with them and with k1.
+
+    d = u (1 + k1 r^2) with r = |u|; of a fisheye u / r theta (1 + k1 theta^2) with theta = atan r.
+    """
+    r = np.maximum(np.sqrt(np.square(u).sum(axis=-1, keepdims=True)), 1e-9)
+    angle, angle_r = (np.arctan(r), 1.0 / (1.0 + r**2)) if problem.fisheye else (r, np.ones_like(r))
+    along = u / r
+    grows = angle * (1.0 + problem.k1 * angle**2) / r
+    d_r = (1.0 + 3.0 * problem.k1 * angle**2) * angle_r
+    d_u = grows[..., None] * np.eye(2) + (d_r - grows)[..., None] * along[..., :, None] * along[..., None, :]
+    return grows * u, d_u, angle**3 * along
 
 
 def _huber(problem: LensProblem, q: Floats, d: Floats) -> tuple[Floats, Floats, Floats]:
@@ -156,15 +171,14 @@ def _huber(problem: LensProblem, q: Floats, d: Floats) -> tuple[Floats, Floats, 
 def _linearise(problem: LensProblem, prior: FocalPrior | None) -> tuple[float, _System]:
     """The cost and the normal equations at the present values."""
     prior = prior or FocalPrior(problem.log_focal, _HELD)
-    turned, q, u, d = _project(problem)
+    turned, q, u = _project(problem)
+    d, d_u, d_k1 = _distorted(problem, u)
     r, weight, each = _huber(problem, q, d)
     focal_px, sigma_px = math.exp(problem.log_focal), problem.sigma_px
     known = np.array([0.0, prior.log_focal]), np.array([SIGMA_K1, prior.sigma]) ** -2.0
     away = problem.shared - known[0]
     cost = float(each.sum()) + 0.5 * float(known[1] @ away**2)
 
-    r2 = np.square(u).sum(axis=-1)[..., None, None]
-    d_u = (1.0 + problem.k1 * r2) * np.eye(2) + 2.0 * problem.k1 * u[..., :, None] * u[..., None, :]
     u_q = np.concatenate([np.broadcast_to(np.eye(2), (*u.shape, 2)), -u[..., None]], axis=-1)
     J_q = (focal_px / sigma_px) * (d_u @ u_q) / np.maximum(q[..., 2], _NEAREST)[..., None, None]  # (P, I, 2, 3)
     J_corner = np.concatenate(
@@ -176,7 +190,7 @@ def _linearise(problem: LensProblem, prior: FocalPrior | None) -> tuple[float, _
     )
     J_turn = np.cross(turned[:, :, None, :], J_q)  # d q / d w = -[turned]x
     J_pose = np.concatenate([J_turn, J_q * problem.corner[:, 2, None, None, None]], axis=-1)[:, 1:]
-    J_lens = focal_px / sigma_px * np.stack([u * r2[..., 0], d], axis=-1)
+    J_lens = focal_px / sigma_px * np.stack([d_k1, d], axis=-1)
 
     P, poses = len(r), 6 * (IMAGES - 1)
     by_image = np.zeros((P, IMAGES, 2, poses + 2))

@@ -19,6 +19,7 @@ MOST_WORDS, LEAST_WORDS = 1024, 16
 DESCRIPTORS_PER_WORD = 8
 LEARNED_FROM = 20_000  # descriptors at the most
 ROUNDS = 5
+AT_A_TIME = 1024  # descriptors, so that a map process does not grow by it
 STALE_REL = 1 / 32  # of the keyframes may be missing in the matrix: a drive's own last ones are none of its loops
 _SEED = 39
 
@@ -31,14 +32,17 @@ def learn_words(descriptors: NDArray[np.uint8]) -> NDArray[np.uint8]:
     count = int(np.clip(len(descriptors) // DESCRIPTORS_PER_WORD, min(LEAST_WORDS, len(descriptors)), MOST_WORDS))
     if not count:
         return np.zeros((0, DESCRIPTOR_BYTES), np.uint8)
-    signs = _signs(descriptors)
-    words = signs[random.choice(len(signs), count, replace=False)].copy()
+    words = _signs(descriptors[random.choice(len(descriptors), count, replace=False)])
     for _ in range(ROUNDS):
-        nearest = (signs @ words.T).argmax(axis=1)
-        order = np.argsort(nearest, kind="stable")
-        present, begin = np.unique(nearest[order], return_index=True)
-        sums = np.add.reduceat(signs[order], begin, axis=0)
-        words[present] = np.where(sums >= 0.0, 1.0, -1.0)
+        sums, present = np.zeros_like(words), np.zeros(count, bool)
+        for begin in range(0, len(descriptors), AT_A_TIME):
+            signs = _signs(descriptors[begin : begin + AT_A_TIME])
+            nearest = (signs @ words.T).argmax(axis=1)
+            order = np.argsort(nearest, kind="stable")
+            numbers, first = np.unique(nearest[order], return_index=True)
+            sums[numbers] += np.add.reduceat(signs[order], first, axis=0)
+            present[numbers] = True
+        words[present] = np.where(sums[present] >= 0.0, 1.0, -1.0)
     return np.packbits(words > 0.0, axis=1)
 
 
@@ -54,8 +58,8 @@ def words_of(descriptors: NDArray[np.uint8], words: NDArray[np.uint8]) -> Ints:
         out: Ints = hamming(descriptors, words).argmin(axis=1)
         return out
     signs = _signs(words).T
-    step = 8192  # at a time, so that memory stays small
-    parts = [(_signs(descriptors[i : i + step]) @ signs).argmax(axis=1) for i in range(0, len(descriptors), step)]
+    begins = range(0, len(descriptors), AT_A_TIME)
+    parts = [(_signs(descriptors[i : i + AT_A_TIME]) @ signs).argmax(axis=1) for i in begins]
     return np.concatenate(parts).astype(np.int64)
 
 

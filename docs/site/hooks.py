@@ -18,17 +18,19 @@ PAGES = {  # page of the checkout -> of the site
     "perf/README.md": "benchmarks.md",
     "perf/results/report.md": "benchmark-report.md",
 }
+WORKER = "assets/iframe-worker.js"  # the search of a site that is opened from disk; mkdocs.yml names it too
 _LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s#]+)(#[^)]*)?\)")
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Adds the pages from outside, and the pictures that they show."""
+    """Adds the pages from outside, the pictures that they show, and the script of the search."""
     for source, target in PAGES.items():
         files.append(File.generated(config, target, content=_of_site((ROOT / source).read_text(), source)))
         for shown in re.findall(r"!\[[^\]]*\]\(([^)]+\.(?:png|jpg))\)", (ROOT / source).read_text()):
             place = posixpath.normpath(posixpath.join(posixpath.dirname(source), shown))
             if not place.startswith("docs/"):
                 files.append(File.generated(config, _picture(place), abs_src_path=str(ROOT / place)))
+    files.append(File.generated(config, WORKER, abs_src_path=str(Path(__file__).with_name("iframe-worker.js"))))
     return files
 
 

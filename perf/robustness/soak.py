@@ -28,17 +28,24 @@ import psutil
 from numpy.typing import ArrayLike
 
 from birdslam.geometry.arrays import Floats
+from birdslam.loops.keyframe_builder import MOST_POINTS
+from birdslam.loops.map_file import MapError
 from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.reporting.figures import BLOCKS
 from birdslam.perf.robustness.faulty_vehicle import Vehicle, ends_with_its_vehicle, model_options, record_options
+from birdslam.runtime.maps.map_store import read_map
 from birdslam.runtime.transport.closing import Closing
 
 label = "memory, descriptors, watchdogs and drops of every process over a long drive"
 
+MAP_FILE = "soak.map"
 WARM_S, SAMPLE_S, SAID_S = 60.0, 5.0, 30.0
 SPAN = 6  # samples at either end whose medians are compared: what a process holds swings by its garbage
 GROWTH = 0.01
 AGE_GROWTH = 0.1  # of the age's median, first quarter to last
+# What a keyframe holds: points, depths and descriptors (64 bytes a point), its row of the index twice (24), poses,
+# links, lines and the frame that Python has for each of these
+KEYFRAME_MIB = (MOST_POINTS * (64 + 24) + 3072) / 2**20
 WATCHDOG_S = 5.0  # of the supervisor, as in deploy/birdslam.service
 
 
@@ -85,6 +92,7 @@ class Series:
     mib: list[float] = field(default_factory=list)
     descriptors: list[int] = field(default_factory=list)
     pids: set[int] = field(default_factory=set)
+    kept_mib: float = 0.0  # of what it gained: a longer map
 
     def ends(self) -> tuple[float, float]:
         """Resident memory (MiB) at the beginning and at the end."""
@@ -94,7 +102,7 @@ class Series:
     @property
     def growth(self) -> float:
         before, after = self.ends()
-        return after / before - 1.0
+        return (after - self.kept_mib) / before - 1.0
 
     @property
     def leaked(self) -> int:
@@ -109,6 +117,8 @@ class Ages:
 
     t_s: list[float] = field(default_factory=list)
     ms: list[float] = field(default_factory=list)
+    begin_ns: int = 0  # the source's time of the first one, and how far it is from there
+    driven_ns: int = 0
 
 
 def slope(t_s: ArrayLike, values: ArrayLike, of: Callable[[Floats], float] = np.mean) -> tuple[float, float]:
@@ -167,6 +177,17 @@ def ages(found: Ages) -> tuple[str, list[str]]:
     return said, [f"the age grew from {p50:.1f} to {end_p50:.1f} ms in the median"] if grew else []
 
 
+def keyframes_in(file: Path) -> int:
+    """Of the map as it was last saved.
+
+    A recording that goes round is a new street to it each time, since the car is elsewhere at once.
+    """
+    try:
+        return len(read_map(file))
+    except MapError:  # none was saved yet
+        return 0
+
+
 def restarts(summary: dict[str, Any]) -> dict[str, int]:
     """Of each node, and of the recorder where there is one: dead, or ended by its watchdog."""
     recorder = {"record": summary["recording"]["restarts"]} if "recording" in summary else {}
@@ -203,22 +224,33 @@ def drive(vehicle: Vehicle, minutes: float) -> tuple[dict[str, Series], Ages]:
     until_s = begun_s + max(60.0 * minutes, WARM_S + 2 * SAMPLE_S)
     due_s, said_s, frames = begun_s + WARM_S, begun_s, 0
     series: dict[str, Series] = defaultdict(Series)
-    found = Ages()
+    found, map_file, keyframes = Ages(), vehicle.place / MAP_FILE, 0
     while (now_s := time.monotonic()) < until_s:
         estimate = vehicle.planner.wait(1.0)
-        frames += estimate is not None
+        if estimate is not None:
+            frames += 1
+            found.driven_ns = estimate.t_source_ns - found.begin_ns if found.begin_ns else 0
+            found.begin_ns = found.begin_ns or estimate.t_source_ns
         if estimate is not None and now_s >= begun_s + WARM_S:
             found.t_s.append(now_s)
             found.ms.append((time.monotonic_ns() - estimate.t_capture_ns) / 1e6)
         if vehicle.process.poll() is not None:
             raise RuntimeError(f"the run has ended by itself: {(vehicle.place / 'run.log').read_text()[-1000:]}")
         if now_s >= due_s:
+            keyframes = keyframes if series else keyframes_in(map_file)
             due_s += SAMPLE_S
             sample(vehicle.processes(), series)
         if now_s >= said_s + SAID_S:
             said_s += SAID_S
             held = ", ".join(f"{name} {one.mib[-1]:.1f} ({one.growth:+.2%})" for name, one in series.items())
             print(f"{(now_s - begun_s) / 60.0:5.1f} min  {frames} estimates  {held or 'warming up'}", flush=True)
+    # A keyframe comes into the file within ten seconds or so
+    gained = keyframes_in(map_file) - keyframes
+    if gained > 0 and "map" in series:
+        series["map"].kept_mib = gained * KEYFRAME_MIB
+        print(
+            f"map: {keyframes} keyframes, then {gained} more: {series['map'].kept_mib:.1f} MiB of its growth are theirs"
+        )
     return dict(series), found
 
 
@@ -226,7 +258,7 @@ def run(arguments: list[str]) -> int:
     """Gives the exit status."""
     parser = benchmark_parser("soak", label, output="")
     parser.add_argument("--minutes", type=float, default=30.0)
-    parser.add_argument("--rate", type=float, default=33.0, metavar="HZ")
+    parser.add_argument("--rate", type=float, default=33.0, metavar="HZ", help="above the recording's: faster")
     parser.add_argument("--source", default="", metavar="URI", help="goes round and round; left out: a software camera")
     parser.add_argument("--map", action="store_true", help="localised in a map that it makes")
     parser.add_argument("--record", action="store_true", help="with a recorder beside it")
@@ -237,7 +269,7 @@ def run(arguments: list[str]) -> int:
         place = Path(folder)
         recorded = record_options(place) if options.record else []
         os.environ.update(systemd.environment)
-        mapped = ["--set", f"results.map={place / 'soak.map'}"] if options.map else []
+        mapped = ["--set", f"results.map={place / MAP_FILE}"] if options.map else []
         extra = [*model_options(options.models), *recorded, *mapped, *more]
         with Vehicle(place, *extra, rate_hz=options.rate, source=options.source) as vehicle:
             series, found_ages = drive(vehicle, options.minutes)
@@ -248,6 +280,10 @@ def run(arguments: list[str]) -> int:
         f"frames {summary['frames_in']}, rate {summary['rate_hz']} Hz, age {summary['age_ms']} ms, {summary['budget']}"
     )
     print(f"longest silence of the supervisor's watchdog: {systemd.longest_s:.1f} s of {WATCHDOG_S:g}")
+    driven_h = found_ages.driven_ns / 3.6e12
+    print(
+        f"driven: {driven_h:.3f} h of the source's time, {60.0 * driven_h / options.minutes:.2f} times as fast as it is"
+    )
     said, late = ages(found_ages)
     print(said)
     found = [*faults(series, summary, systemd), *late, *([f"the run ended with status {status}"] if status else [])]

@@ -7,7 +7,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 from birdslam.calibration.intrinsics import Intrinsics, from_chessboard, read_intrinsics
-from birdslam.calibration.lens import FIELD_OF_VIEW_DEG, STATED_SIGMA_REL, focal_by_field_of_view
+from birdslam.calibration.lens import (
+    FIELD_OF_VIEW_DEG,
+    STATED_SIGMA_REL,
+    WIDE_DEG,
+    WIDE_SIGMA_REL,
+    focal_by_field_of_view,
+)
 from birdslam.ros.bag import BagTopics
 from birdslam.runtime.configuration import ConfigurationError
 from birdslam.runtime.nodes.sources import parsed
@@ -60,6 +66,7 @@ class FocalLength(NamedTuple):
     sigma_rel: float
     by: str
     by_view: bool = True  # of the image across, of which nobody says whether the lens's distortion is counted
+    fisheye: bool = False  # about equidistant: no pinhole sees so far
 
 
 def focal_length_of(given: Given, uri: str, width_px: int) -> FocalLength:
@@ -67,8 +74,9 @@ def focal_length_of(given: Given, uri: str, width_px: int) -> FocalLength:
     if given.fov_deg is not None:
         if not 10.0 <= given.fov_deg <= 150.0:
             raise ConfigurationError(f"--fov {given.fov_deg:g}: is no field of view of a camera here (10 to 150 deg)")
-        focal_px = focal_by_field_of_view(width_px, given.fov_deg)
-        return FocalLength(focal_px, STATED_SIGMA_REL, f"as stated, {given.fov_deg:g} deg across")
+        words, fisheye = f"as stated, {given.fov_deg:g} deg across", given.fov_deg >= WIDE_DEG
+        focal_px = focal_by_field_of_view(width_px, given.fov_deg, fisheye)
+        return FocalLength(focal_px, WIDE_SIGMA_REL if fisheye else STATED_SIGMA_REL, words, fisheye=fisheye)
     kind, path = class_and_path(uri)
     stated_px = kind.stated_focal_px(path)
     if stated_px is not None and focal_by_field_of_view(width_px, 150.0) < stated_px:

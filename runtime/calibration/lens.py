@@ -49,18 +49,19 @@ def lens_of_drive(
                     yield frame.image, np.zeros((0, 4)) if found is None else found.boxes_px
 
         corners = followed_corners(images(), camera)
-    lens = self_calibrate(corners, size_px, focal_px, sigma_rel, known.by_view)
+    lens = self_calibrate(corners, size_px, focal_px, sigma_rel, known.by_view, known.fisheye)
     if lens is None and not must_show and len(corners) >= IMAGES:
         return Intrinsics(
             fx_px=focal_px,
             fy_px=focal_px,
             cx_px=middle[0],
             cy_px=middle[1],
-            distortion=(),
+            distortion=(0.0,) * 4 if known.fisheye else (),
+            fisheye=known.fisheye,
             width_px=width_px,
             height_px=height_px,
             source=f"assumed, since the drive does not show it: focal length {focal_px:.0f} px +- {sigma_rel:.0%}, "
-            f"{by}; no distortion",
+            f"{by}; {'equidistant' if known.fisheye else 'no distortion'}",
             sigma_focal_px=focal_px * sigma_rel,
         )
     if lens is None:
@@ -76,6 +77,7 @@ def lens_of_drive(
         cx_px=middle[0],
         cy_px=middle[1],
         distortion=(lens.k1, 0.0, 0.0, 0.0),
+        fisheye=lens.fisheye,
         width_px=width_px,
         height_px=height_px,
         source=(
