@@ -53,13 +53,6 @@ def test_what_grows_is_named(one: Series, said: str, systemd: Systemd) -> None:
     assert list(faults({"perceive": one}, WELL, systemd)) == [said]
 
 
-def test_a_longer_map_is_no_growth_of_its_process(systemd: Systemd) -> None:
-    grown = [100.0] * 12 + [105.0] * 12
-    for kept_mib, said in ((5.0, []), (3.0, ["map grew by 2.0%"])):
-        one = Series([5.0 * k for k in range(24)], grown, [30] * 24, {1}, kept_mib)
-        assert list(faults({"map": one}, WELL, systemd)) == said
-
-
 def test_estimates_that_come_later_and_later_are_named() -> None:
     t_s = [0.03 * k for k in range(400)]
     said, bad = ages(Ages(t_s, [20.0, 22.0, 21.0, 40.0] * 100))

@@ -52,7 +52,7 @@ def cut_out(image: NDArray[np.uint8], box_px: Floats, spare: float = 1.0) -> NDA
         small = cv2.resize(part, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         ratio = np.array([small.shape[1] / part.shape[1], small.shape[0] / part.shape[0]])
         shift = ((matrix[:, 2] - low) + 0.5) * ratio - 0.5
-        image = small
+        image = small.astype(np.uint8, copy=False)
         matrix = np.column_stack([np.diag(ratio / scale), shift])
     out = cv2.warpAffine(
         image, matrix, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE

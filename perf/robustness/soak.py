@@ -28,7 +28,6 @@ import psutil
 from numpy.typing import ArrayLike
 
 from birdslam.geometry.arrays import Floats
-from birdslam.loops.keyframe_builder import MOST_POINTS
 from birdslam.loops.map_file import MapError
 from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.reporting.figures import BLOCKS
@@ -43,9 +42,6 @@ WARM_S, SAMPLE_S, SAID_S = 60.0, 5.0, 30.0
 SPAN = 6  # samples at either end whose medians are compared: what a process holds swings by its garbage
 GROWTH = 0.01
 AGE_GROWTH = 0.1  # of the age's median, first quarter to last
-# What a keyframe holds: points, depths and descriptors (64 bytes a point), its row of the index twice (24), poses,
-# links, lines and the frame that Python has for each of these
-KEYFRAME_MIB = (MOST_POINTS * (64 + 24) + 3072) / 2**20
 WATCHDOG_S = 5.0  # of the supervisor, as in deploy/birdslam.service
 
 
@@ -92,7 +88,6 @@ class Series:
     mib: list[float] = field(default_factory=list)
     descriptors: list[int] = field(default_factory=list)
     pids: set[int] = field(default_factory=set)
-    kept_mib: float = 0.0  # of what it gained: a longer map
 
     def ends(self) -> tuple[float, float]:
         """Resident memory (MiB) at the beginning and at the end."""
@@ -102,7 +97,7 @@ class Series:
     @property
     def growth(self) -> float:
         before, after = self.ends()
-        return (after - self.kept_mib) / before - 1.0
+        return after / before - 1.0
 
     @property
     def leaked(self) -> int:
@@ -244,13 +239,8 @@ def drive(vehicle: Vehicle, minutes: float) -> tuple[dict[str, Series], Ages]:
             said_s += SAID_S
             held = ", ".join(f"{name} {one.mib[-1]:.1f} ({one.growth:+.2%})" for name, one in series.items())
             print(f"{(now_s - begun_s) / 60.0:5.1f} min  {frames} estimates  {held or 'warming up'}", flush=True)
-    # A keyframe comes into the file within ten seconds or so
-    gained = keyframes_in(map_file) - keyframes
-    if gained > 0 and "map" in series:
-        series["map"].kept_mib = gained * KEYFRAME_MIB
-        print(
-            f"map: {keyframes} keyframes, then {gained} more: {series['map'].kept_mib:.1f} MiB of its growth are theirs"
-        )
+    if keyframes:  # one comes into the file within ten seconds or so
+        print(f"map: {keyframes} keyframes after the first minute, {keyframes_in(map_file)} at the end")
     return dict(series), found
 
 
