@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import json
 import re
 from pathlib import Path
@@ -17,6 +18,7 @@ from birdslam.geometry.se2 import SE2
 from birdslam.outputs.drive_files import Recorder, ResultsError
 from birdslam.outputs.earth_files import Way, write_ways
 from birdslam.outputs.placed import Place, write_places
+from birdslam.outputs.report.drawings import speeds
 from birdslam.outputs.report.drive_table import read_drive
 from birdslam.perf.browser import reports
 from birdslam.perf.browser.chromium import chromium
@@ -123,6 +125,18 @@ def test_the_drive_is_read_back_in_one_plane(results: Path) -> None:
     files = {"ego.tum.txt", "ego.kitti.txt", "ego.geojson", "frames.csv", "map.geojson", "road.geojson"}
     assert set(drive.files) == {*files, "tracks.geojson"}
     assert len(drive.lanes_m) == FRAMES
+
+
+def test_the_band_of_the_speed_is_not_drawn_across_what_is_not_valid(results: Path) -> None:
+    drive = read_drive(results)
+    half = len(drive.t_s) // 2
+    valid = np.ones(len(drive.t_s), bool)
+    valid[half] = False
+    band = speeds(dataclasses.replace(drive, valid=valid), np.arange(len(drive.t_s)))[0]
+    outlines = np.split(np.array(band["x"], float), np.flatnonzero([x is None for x in band["x"]]))
+    spans = [(np.nanmin(part), np.nanmax(part)) for part in outlines if np.isfinite(part).any()]
+    assert spans
+    assert all(end < drive.t_s[half] or begin > drive.t_s[half] for begin, end in spans)
 
 
 def test_the_page_is_whole_offline_and_escaped(results: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -67,13 +67,21 @@ def speeds(drive: DriveTable, shown: Ints) -> list[Trace]:
     speed, t_s = smoothed_speed(drive)[shown], drive.t_s[shown]
     sigma = speed * drive.scale_sigma_rel[shown]
     sure = drive.valid[shown] & np.isfinite(speed)
-    band = {"type": "scatter", "mode": "lines", "x": rounded(t_s), "line": {"width": 0}, "hoverinfo": "skip"}
+    # A closed outline of each stretch: a band between two lines would be drawn across what lies between stretches
+    x, y = [], []
+    for begin, end in drive.stretches(sure):
+        span = slice(begin, end)
+        x += [t_s[span], t_s[span][::-1], [np.nan]]
+        y += [(speed + sigma)[span], (speed - sigma)[span][::-1], [np.nan]]
     return [
-        {**band, "y": rounded(np.where(sure, speed + sigma, np.nan)), "showlegend": False},
         {
-            **band,
-            "y": rounded(np.where(sure, speed - sigma, np.nan)),
-            "fill": "tonexty",
+            "type": "scatter",
+            "mode": "lines",
+            "x": rounded(np.concatenate([*x, []])),
+            "y": rounded(np.concatenate([*y, []])),
+            "line": {"width": 0},
+            "hoverinfo": "skip",
+            "fill": "toself",
             "fillcolor": "rgba(31,157,107,0.25)",
             "name": "1 sigma",
         },
