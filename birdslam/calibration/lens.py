@@ -58,8 +58,8 @@ _SHOWN = 0.7  # of the sigma beforehand: a focal length that is known no better 
 # How wide cameras see, across, and 1-sigma of their focal length as a fraction: by judgement
 FIELD_OF_VIEW_DEG = {"dashcam": (75.0, 0.25), "phone": (65.0, 0.1)}
 STATED_SIGMA_REL = 0.03  # of a focal length by a field of view that somebody states
-# A lens that sees farther than this across is no pinhole with some distortion, but about equidistant; by judgement
-WIDE_DEG = 100.0
+# A lens that sees farther than this across is about equidistant: rectilinear ones are built up to here; by judgement
+WIDE_DEG = 110.0
 # ... of whose focal length it is this: equisolid and stereographic lenses are 4 to 6 % and 8 to 15 % off (110, 140 deg)
 WIDE_SIGMA_REL = 0.08
 LEAST_SIGMA_REL = 0.03  # of the focal length: on 19 real drives the fit's own was up to 26 times too small
