@@ -258,7 +258,7 @@ def test_a_phones_metadata_state_the_focal_length(suffix: str, tmp_path: Path) -
     path = film(tmp_path / f"phone.{suffix}", range(0, 200, 40), metadata={FOCAL_KEY: "26", "title": "a drive"})
     assert VideoRecording.stated_focal_px(path) == pytest.approx(WIDTH * 26 / 36)
     known = focal_length_of(Given(), f"video:{path}", WIDTH)
-    assert (known.focal_px, known.sigma_rel) == (pytest.approx(WIDTH * 26 / 36), METADATA_SIGMA_REL)
+    assert (known.px, known.sigma_rel) == (pytest.approx(WIDTH * 26 / 36), METADATA_SIGMA_REL)
     assert "metadata" in known.by
     assert "as stated, 60 deg" in focal_length_of(Given(fov_deg=60.0), f"video:{path}", WIDTH)[2]  # goes before it
     without = film(tmp_path / f"other.{suffix}", range(0, 200, 40))
