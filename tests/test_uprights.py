@@ -52,7 +52,8 @@ def test_a_straight_drive_shows_the_distortion_within_its_sigma(k1: float, roll_
 @pytest.mark.parametrize("focal", [0.52, 0.42])
 def test_a_fisheye_is_told_with_its_focal_length(focal: float) -> None:
     found = lens_by_uprights(street(focal, fisheye=True))
-    assert found is not None and found.fisheye_focal is not None
+    assert found is not None
+    assert found.fisheye_focal is not None
     assert found.fisheye_focal == pytest.approx(focal, rel=WIDE_SIGMA_REL)
 
 
@@ -81,7 +82,10 @@ def test_a_fisheye_of_unknown_view_takes_its_focal_length_from_upright_lines() -
     unknown = FocalLength(650.0, sigma_rel, f"that of a dashcam, {view_deg:g} deg across")
     uprights = LensByUprights(bend=-0.9, bend_sigma=0.1, fisheye_focal=0.45, edges=500)
     found = with_uprights(unknown, uprights, WIDTH_PX)
-    assert found.fisheye and found.px == 450.0 and found.sigma_rel == WIDE_SIGMA_REL and "fisheye" in found.by
+    assert found.fisheye
+    assert found.px == 450.0
+    assert found.sigma_rel == WIDE_SIGMA_REL
+    assert "fisheye" in found.by
     stated = FocalLength(650.0, 0.03, "as stated, 75 deg across")
     assert with_uprights(stated, uprights, WIDTH_PX) is stated
     assert with_uprights(unknown, None, WIDTH_PX) is unknown
@@ -89,6 +93,8 @@ def test_a_fisheye_of_unknown_view_takes_its_focal_length_from_upright_lines() -
 
 def test_what_lines_say_of_k1_and_what_is_known_of_cameras_count_by_their_sigmas() -> None:
     k1, sigma = k1_by_bend((-0.5, 0.1), FOCAL)
-    assert k1 == pytest.approx(-0.5 * FOCAL**2, rel=0.05) and sigma == pytest.approx(0.1 * FOCAL**2, rel=0.05)
+    assert k1 == pytest.approx(-0.5 * FOCAL**2, rel=0.05)
+    assert sigma == pytest.approx(0.1 * FOCAL**2, rel=0.05)
     k1, sigma = k1_by_bend((-0.5, 100.0), FOCAL)
-    assert abs(k1) < 0.01 and sigma == pytest.approx(SIGMA_K1, rel=0.01)
+    assert abs(k1) < 0.01
+    assert sigma == pytest.approx(SIGMA_K1, rel=0.01)

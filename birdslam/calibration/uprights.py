@@ -2,9 +2,9 @@
 
 A lens without distortion shows them as straight lines through one vanishing point, however the car drives; a real one
 bends them, and so tilts each piece of them by where it lies in the image (plumb lines; Brown, "Close-range camera
-calibration", 1971). So a straight drive shows the distortion here, which its motion hardly does, and whether the lens is
-a fisheye. Of the focal length it shows nothing, but that of a fisheye, whose distortion is its focal length. Vehicles
-and people taper upwards, so that only the upper half of an image counts.
+calibration", 1971). So a straight drive shows the distortion here, which its motion hardly does, and whether the lens
+is a fisheye. Of the focal length it shows nothing, but that of a fisheye, whose distortion is its focal length.
+Vehicles and people taper upwards, so that only the upper half of an image counts.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -54,10 +55,8 @@ def upright_edges(image: NDArray[np.uint8]) -> Floats:
     if scale < 1.0:
         grey = np.asarray(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
     height_px, width_px = grey.shape
-    found = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD).detect(grey)[0]
-    if found is None:
-        return np.zeros((0, 2, 2))
-    ends = np.asarray(found, np.float64).reshape(-1, 2, 2)
+    found: Any = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD).detect(grey)[0]
+    ends = np.zeros((0, 2, 2)) if found is None else np.asarray(found, np.float64).reshape(-1, 2, 2)
     ends = (ends - 0.5 * (np.array([width_px, height_px]) - 1.0)) / width_px
     ends = np.take_along_axis(ends, np.argsort(ends[..., 1], axis=1)[..., None], axis=1)
     across, down = (ends[:, 1] - ends[:, 0]).T
@@ -123,7 +122,7 @@ def _costs(edges: Floats, block: NDArray[np.int64], straight: Callable[[Floats],
         tilt = np.linalg.solve(information, (A * weight[:, None]).T @ lean / _LEAN**2)
         excess = np.square((lean - A @ tilt) / _LEAN)
         weight = length / np.square(1.0 + excess)  # Geman and McClure's
-    return np.bincount(block, length * excess / (1.0 + excess), _BLOCKS)
+    return np.asarray(np.bincount(block, length * excess / (1.0 + excess), _BLOCKS), np.float64)
 
 
 def _lowest(values: Floats, costs: Floats) -> float:

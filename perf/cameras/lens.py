@@ -4,8 +4,9 @@
 
 Each drive twice, with a focal length beforehand that is 15 % too long and 15 % too short, known to 15 %. Rows: turn of
 the camera within the windows, errors of focal length and k1 with their own sigma, whether the drive showed the focal
-length, what upright lines say of the bend, and the way of its first 6 s by the found lens over that by the true one. Rendered dashcams lie in `--films`
-(tests/dashcams); `--render` renders them anew (extra `train`, PyAV). Writes lens.json and lens.md.
+length, what upright lines say of the bend, and the way of its first 6 s by the found lens over that by the true one.
+Rendered dashcams lie in `--films` (tests/dashcams); `--render` renders them anew (extra `train`, PyAV). Writes
+lens.json and lens.md.
 """
 
 from __future__ import annotations
@@ -257,7 +258,8 @@ def row_text(row: dict[str, Any]) -> str:
     return (
         f"turned {row['turned_deg']:.0f} deg, f {row['focal_error']:+.1%} +- {row['focal_sigma']:.1%} "
         f"{'' if row['focal_shown'] else '(kept) '} k1 {row['k1']:+.3f} +- {row['k1_sigma']:.3f} (true "
-        f"{row['true_k1']:+.3f}; bend by lines {_bend(row)}, true {row['true_bend']:+.2f}), way {way}, by the true lens {_off(row['way_by_true_lens'])} of the truth"
+        f"{row['true_k1']:+.3f}; bend by lines {_bend(row)}, true {row['true_bend']:+.2f}), way {way}, by the true lens "
+        f"{_off(row['way_by_true_lens'])} of the truth"
     )
 
 
@@ -283,11 +285,11 @@ def table(rows: list[dict[str, Any]]) -> str:
         "long (`phone`: 30 ms), and nothing in a film tells how long its camera takes. So a film's stated sigma has",
         "17 ms of it in (runtime/calibration/height.py), the more the faster it drives.",
         "",
-        "*Bend* is k1 over the square of the focal length in image widths: what lines that are upright in the world say",
-        "of it (birdslam/calibration/uprights.py), which is known beforehand to the bundle adjustment, beside the true one.",
+        "*Bend* is k1 over the square of the focal length in image widths: what lines that are upright in the world",
+        "say of it (birdslam/calibration/uprights.py), which the bundle adjustment takes as known beforehand.",
         "",
-        "| drive | prior | turn, deg | focal length off by | sigma | | bend by lines | true bend | k1 | sigma | true k1 |"
-        " way | true lens |",
+        "| drive | prior | turn, deg | focal length off by | sigma | | bend by lines | true bend | k1 | sigma "
+        "| true k1 | way | true lens |",
         "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
@@ -298,7 +300,7 @@ def table(rows: list[dict[str, Any]]) -> str:
         way = f"{_off(row['way_over_true'])} | {_off(row['way_by_true_lens'])}"
         out.append(
             f"{head} {row['turned_deg']:.0f} | {row['focal_error']:+.1%} | {row['focal_sigma']:.1%} | "
-            f"{'shown' if row['focal_shown'] else 'kept'} | {_bend(row)} | {row['true_bend']:+.2f} | {row['k1']:+.3f} | {row['k1_sigma']:.3f} | "
-            f"{row['true_k1']:+.3f} | {way} |"
+            f"{'shown' if row['focal_shown'] else 'kept'} | {_bend(row)} | {row['true_bend']:+.2f} | {row['k1']:+.3f} | "
+            f"{row['k1_sigma']:.3f} | {row['true_k1']:+.3f} | {way} |"
         )
     return "\n".join(out) + "\n"
