@@ -44,7 +44,8 @@ def test_what_a_start_makes_once_is_not_carried_on(systemd: Systemd) -> None:
     assert list(faults({"map": warm}, WELL, systemd)) == []
     slow = series([100.0 + 0.005 * k + 0.01 * noise for k, noise in enumerate(rng.normal(size=120))], [30] * 120)
     (said,) = faults({"map": slow}, WELL, systemd)  # half a percent in ten minutes
-    assert said.startswith("map would grow by 2") and said.endswith("in 8 hours")
+    assert said.startswith("map would grow by 2")
+    assert said.endswith("in 8 hours")
 
 
 @pytest.mark.parametrize(

@@ -103,7 +103,7 @@ class Series:
         return after / before - 1.0
 
     def in_a_shift(self) -> tuple[float, float]:
-        """By what share it would grow in SHIFT_H as it does in the second half, and the sigma; NaN: too short to tell."""
+        """By what share it would grow in SHIFT_H as in its second half, and the sigma; NaN: too short to tell."""
         half = len(self.mib) // 2
         gain, sigma = slope(self.t_s[half:], self.mib[half:])
         return gain * SHIFT_H / self.mib[0], sigma * SHIFT_H / self.mib[0]
