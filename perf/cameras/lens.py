@@ -3,10 +3,9 @@
     python -m perf lens [DRIVE ...] [--output DIR] [--data DIR] [--films DIR] [--render DIR] [--images N] [--networks]
 
 Each drive twice, with a focal length beforehand that is 15 % too long and 15 % too short, known to 15 %. Rows: turn of
-the camera within the windows, errors of focal length and k1 with their own sigma, whether the drive showed the focal
-length, what upright lines say of the bend, and the way of its first 6 s by the found lens over that by the true one.
-Rendered dashcams lie in `--films` (tests/dashcams); `--render` renders them anew (extra `train`, PyAV). Writes
-lens.json and lens.md.
+the camera, errors of focal length and k1 with their own sigma, whether the drive showed the focal length, the bend by
+upright lines, and the way of its first 6 s by the found lens over that by the true one. Rendered dashcams lie in
+`--films`; `--render` renders them anew (extra `train`, PyAV). Writes lens.json and lens.md.
 """
 
 from __future__ import annotations
@@ -258,8 +257,8 @@ def row_text(row: dict[str, Any]) -> str:
     return (
         f"turned {row['turned_deg']:.0f} deg, f {row['focal_error']:+.1%} +- {row['focal_sigma']:.1%} "
         f"{'' if row['focal_shown'] else '(kept) '} k1 {row['k1']:+.3f} +- {row['k1_sigma']:.3f} (true "
-        f"{row['true_k1']:+.3f}; bend by lines {_bend(row)}, true {row['true_bend']:+.2f}), way {way}, by the true lens "
-        f"{_off(row['way_by_true_lens'])} of the truth"
+        f"{row['true_k1']:+.3f}; bend by lines {_bend(row)}, true {row['true_bend']:+.2f}), way {way}, "
+        f"by the true lens {_off(row['way_by_true_lens'])} of the truth"
     )
 
 
@@ -300,7 +299,7 @@ def table(rows: list[dict[str, Any]]) -> str:
         way = f"{_off(row['way_over_true'])} | {_off(row['way_by_true_lens'])}"
         out.append(
             f"{head} {row['turned_deg']:.0f} | {row['focal_error']:+.1%} | {row['focal_sigma']:.1%} | "
-            f"{'shown' if row['focal_shown'] else 'kept'} | {_bend(row)} | {row['true_bend']:+.2f} | {row['k1']:+.3f} | "
-            f"{row['k1_sigma']:.3f} | {row['true_k1']:+.3f} | {way} |"
+            f"{'shown' if row['focal_shown'] else 'kept'} | {_bend(row)} | {row['true_bend']:+.2f} | "
+            f"{row['k1']:+.3f} | {row['k1_sigma']:.3f} | {row['true_k1']:+.3f} | {way} |"
         )
     return "\n".join(out) + "\n"
