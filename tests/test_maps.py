@@ -31,7 +31,7 @@ from birdslam.perf.maps import scale_drift
 from birdslam.runtime.batch.one_map import DRIVE_MAP, join
 from birdslam.runtime.cli.commands import parse
 from birdslam.runtime.configuration import ConfigurationError, load
-from birdslam.runtime.maps import map_drive
+from birdslam.runtime.maps import held_way, map_drive
 from birdslam.runtime.maps.map_drive import MapChoice
 from birdslam.runtime.maps.map_store import read_map, write_map
 from birdslam.types import Attitude
@@ -572,7 +572,7 @@ def test_the_commands(files: dict[str, Path], tmp_path: Path, capsys: pytest.Cap
 
 
 def test_what_is_kept_of_a_long_drive_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(map_drive, "MOST_POSES", 16)
+    monkeypatch.setattr(held_way, "MOST_POSES", 16)
     driving = map_drive.MapDrive(MapChoice(tmp_path / "new.map", extend=True), CAMERA, tmp_path)
     estimates = [estimate for estimate, _, _ in drive(STREET, range(100), 3)]
     for estimate in estimates:

@@ -467,6 +467,21 @@ needs_torch = pytest.mark.skipif(importlib.util.find_spec("torch") is None, reas
 
 
 @needs_torch
+def test_no_certainty_of_an_axis_beyond_the_most_is_rewarded() -> None:
+    import torch
+
+    from birdslam.world.training.losses import von_mises
+
+    angles, costs = torch.tensor([0.3, 0.3]), {}
+    for certain in (0.0, 50.0, 200.0, 1000.0):
+        axis = certain * torch.tensor([[1.0, 0.0], [math.cos(0.6), math.sin(0.6)]])
+        costs[certain] = von_mises(axis, angles, 200.0)
+    assert torch.all(costs[0.0] > costs[200.0][1])
+    assert costs[50.0][1] > costs[200.0][1]
+    torch.testing.assert_close(costs[1000.0], costs[200.0])
+
+
+@needs_torch
 def test_the_perfect_answer_costs_least() -> None:
     import torch
 

@@ -91,6 +91,14 @@ def test_in_the_egos_path_a_decision_is_kept_until_the_velocity_contradicts_it()
     assert stands.standing is None
 
 
+def test_in_the_egos_path_both_may_tell_that_it_drives() -> None:
+    follows = judged(node(0.01, in_path=True), (11.0, 0.0), 0.8)
+    assert follows.moves is Moves.DRIVING
+    assert judged(follows, (0.5, 0.0), 0.5).moves is Moves.DRIVING  # it creeps
+    assert judged(node(0.5, in_path=True), (11.0, 0.0), 5.0).moves is Moves.UNDECIDED  # by the depth's error alone
+    assert judged(node(0.01, in_path=True), (0.4, 0.0), 0.5).moves is Moves.UNDECIDED
+
+
 @pytest.mark.parametrize("vehicle", [node(None), VehicleNode(1, seen_ns=6, standing_seen=0.999)])
 def test_who_is_not_seen_or_not_spoken_of_is_not_judged(vehicle: VehicleNode) -> None:
     judged(vehicle, (0.0, 0.0), 0.5)

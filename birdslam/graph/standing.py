@@ -41,10 +41,12 @@ def judge(v: VehicleNode, velocity: Pair, cov: Quad, birth_det: float, t_ns: int
     det = max(xx * yy - xy * xy, _LEAST_DET)
     z2 = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / det
     by_velocity = _clipped(_logit(PRIOR) + 0.5 * (math.log(birth_det / det) - z2))
+    beside = _logit(PRIOR_BESIDE) - _logit(PRIOR) if v.beside else 0.0  # both have the prior of those on its road
+    standing = _probability((by_velocity + _clipped(_logit(v.standing_seen))) / 2.0 + beside)
     if not v.in_path:
-        beside = _logit(PRIOR_BESIDE) - _logit(PRIOR) if v.beside else 0.0  # both have the prior of those on its road
-        v.standing = _probability((by_velocity + _clipped(_logit(v.standing_seen))) / 2.0 + beside)
-        v.moves = decide(v.moves, v.standing)
+        v.standing, v.moves = standing, decide(v.moves, standing)
+    elif standing <= 1.0 - DECIDED:  # no size and no tilt let what stands come nearer so slowly
+        v.standing, v.moves = standing, Moves.DRIVING
     elif v.moves is not Moves.DRIVING and _probability(by_velocity) <= 1.0 - DECIDED:
         v.standing, v.moves = None, Moves.UNDECIDED
 

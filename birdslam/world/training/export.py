@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import io
+from collections.abc import Sequence
 
 import torch
+from torch import Tensor, nn
 
 from birdslam.perception.decoding.multitask import INPUT, OUTPUTS
 from birdslam.world.training.network import MultiTask
@@ -38,11 +41,23 @@ depth_sigma_rel = {depth_sigma_rel:.2f}
 
 def to_onnx(network: MultiTask, width_px: int, height_px: int) -> bytes:
     """The network as an ONNX file for one image of a size."""
-    network = network.eval().float()
-    image = torch.zeros(1, 3, height_px, width_px)
+    return onnx_file(network, torch.zeros(1, 3, height_px, width_px), INPUT, OUTPUTS)
+
+
+def onnx_file(
+    network: nn.Module, example: Tensor, name: str, outputs: Sequence[str], count: str | None = None
+) -> bytes:
+    """Of a network with one input `name`, as it is used: for as many rows as `example` has, or any `count` of them."""
     file = io.BytesIO()
     torch.onnx.export(
-        network, (image,), file, input_names=[INPUT], output_names=list(OUTPUTS), opset_version=17, dynamo=False
+        copy.deepcopy(network).cpu().eval().float(),
+        (example,),
+        file,
+        input_names=[name],
+        output_names=list(outputs),
+        dynamic_axes=None if count is None else {each: {0: count} for each in (name, *outputs)},
+        opset_version=17,
+        dynamo=False,
     )
     return file.getvalue()
 

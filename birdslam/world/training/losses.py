@@ -62,6 +62,17 @@ def loss(outputs: tuple[Tensor, ...], batch: Batch, config: LossConfig) -> dict[
     }
 
 
+def von_mises(axis: Tensor, angle_rad: Tensor, most: float = math.inf) -> Tensor:
+    """(N,) -log likelihood of angles modulo pi by `axis` (N, 2): cos and sin of twice the angle, times a concentration.
+
+    No certainty beyond the concentration `most` is rewarded. I0 is scaled so that it can't overflow.
+    """
+    length = torch.sqrt(axis.square().sum(dim=1) + 1e-6)
+    concentration = length.clamp(max=most)
+    along = axis[:, 0] * torch.cos(2.0 * angle_rad) + axis[:, 1] * torch.sin(2.0 * angle_rad)
+    return concentration - along * concentration / length + torch.log(torch.special.i0e(concentration))
+
+
 def depth_loss(log_depth: Tensor, batch: Batch, config: LossConfig) -> dict[str, Tensor]:
     """Of the log of the depth (images, rows, columns), by the names under which the curves show its parts."""
     weight = torch.where(batch.sky, config.sky, 1.0)
@@ -172,10 +183,7 @@ def _bodies(body: Tensor, cells: _Cells, config: LossConfig) -> dict[str, Tensor
     size_error = (said[:, _BODY["log_size"]] - size).abs().sum(dim=1)
     sin, cos = of("sin_alpha", "cos_alpha").T
     axis, front = said[:, _BODY["axis"]], said[:, _BODY["front"]]
-    # von Mises of twice the angle: -k cos(2a - m) + log I0(k), with I0 scaled so that it can't overflow
-    concentration = torch.sqrt(axis.square().sum(dim=1) + 1e-6)
-    along = axis[:, 0] * (cos * cos - sin * sin) + axis[:, 1] * 2.0 * sin * cos
-    mises = concentration - along + torch.log(torch.special.i0e(concentration))
+    mises = von_mises(axis, torch.atan2(sin, cos))
     which = functional.softplus(-(front[:, 0] * cos + front[:, 1] * sin)) + 0.002 * front.square().sum(dim=1)
     return {
         "box": config.box * (total(edges) + total(1.0 - _giou(guess, box))),

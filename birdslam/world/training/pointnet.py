@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,6 +20,8 @@ from birdslam.geometry.camera import Camera
 from birdslam.perception.decoding.depth import DepthMap
 from birdslam.perception.pointnet import frustum_of
 from birdslam.perception.pointnet_manifest import Body, Points
+from birdslam.world.training.export import onnx_file
+from birdslam.world.training.losses import von_mises
 from birdslam.world.truth import WorldFrame, WorldObject
 
 POINTS = Points(name="points", count=512, features=("x", "y", "z", "u", "v", "log_depth"), scale=0.5)
@@ -215,36 +216,23 @@ def loss(out: Tensor, target: Tensor) -> dict[str, Tensor]:
     yaw = target[:, 6]
     axis, front = out[:, 7:9], out[:, 9:11]
     log_b_size = out[:, 11].clamp(-5.0, 1.0)
-    concentration = axis.norm(dim=1).clamp(1e-3, _CONCENTRATION_MAX)
-    agree = axis[:, 0] * torch.cos(2.0 * yaw) + axis[:, 1] * torch.sin(2.0 * yaw)
-    log_bessel = torch.log(torch.special.i0e(concentration)) + concentration
     logit = front[:, 0] * torch.cos(yaw) + front[:, 1] * torch.sin(yaw)
     size = (out[:, 4:7] - target[:, 3:6]).abs().sum(dim=1)
     return {
         "depth": (off[:, 2].abs() * torch.exp(-log_b) + log_b).mean(),
         "across": 2.0 * functional.smooth_l1_loss(out[:, :2], target[:, :2], beta=0.1),
         "size": 0.5 * (size * torch.exp(-log_b_size) + 3.0 * log_b_size).mean(),
-        "axis": (log_bessel - agree).mean(),
+        "axis": von_mises(axis, yaw, _CONCENTRATION_MAX).mean(),
         "front": functional.softplus(-logit).mean(),
     }
 
 
 def to_onnx(network: PointNet) -> bytes:
     """The network as an ONNX file for any number of boxes."""
-    file = io.BytesIO()
-    network = copy.deepcopy(network).eval().float()
+    network = copy.deepcopy(network).eval()
     network.points, network.body = _folded(network.points), _folded(network.body)
-    torch.onnx.export(
-        network,
-        (torch.zeros(2, len(POINTS.features), POINTS.count),),
-        file,
-        input_names=[INPUT],
-        output_names=[OUTPUT],
-        dynamic_axes={INPUT: {0: "boxes"}, OUTPUT: {0: "boxes"}},
-        opset_version=17,
-        dynamo=False,
-    )
-    return file.getvalue()
+    example = torch.zeros(2, len(POINTS.features), POINTS.count)
+    return onnx_file(network, example, INPUT, (OUTPUT,), "boxes")
 
 
 def manifest(parameters: int, sha256: str) -> str:

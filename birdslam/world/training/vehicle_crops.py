@@ -6,8 +6,6 @@ nor how large. So what it says is independent of the road under the vehicle, by 
 
 from __future__ import annotations
 
-import copy
-import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,6 +20,8 @@ from torch.nn import functional
 
 from birdslam.geometry.arrays import Floats, Floats32
 from birdslam.perception.crops import CHANNELS, INPUT, KINDS, MEAN_SIZE_M, OUTPUT, WINDOW, cut_out
+from birdslam.world.training.export import onnx_file
+from birdslam.world.training.losses import von_mises
 from birdslam.world.truth import WorldFrame, WorldObject
 
 _CONCENTRATION_MAX = 200.0
@@ -127,15 +127,10 @@ def loss(out: Tensor, target: Tensor) -> dict[str, Tensor]:
     alpha = target[:, 3]
     log_b = log_b.clamp(-4.0, 1.0)
     off = (size - target[:, :3]).abs()
-    length = axis.norm(dim=1).clamp(min=1e-3)
-    concentration = length.clamp(max=_CONCENTRATION_MAX)
-    axis = axis * (concentration / length)[:, None]  # beyond it no certainty is rewarded
-    agree = axis[:, 0] * torch.cos(2.0 * alpha) + axis[:, 1] * torch.sin(2.0 * alpha)
-    log_bessel = torch.log(torch.special.i0e(concentration)) + concentration
     logit = front[:, 0] * torch.cos(alpha) + front[:, 1] * torch.sin(alpha)
     return {
         "size": (off * torch.exp(-log_b) + log_b).mean(),
-        "axis": (log_bessel - agree).mean(),
+        "axis": von_mises(axis, alpha, _CONCENTRATION_MAX).mean(),
         "front": functional.softplus(-logit).mean(),
         "kind": functional.cross_entropy(kind, target[:, 4].long()),
         "visible": functional.binary_cross_entropy_with_logits(visible[:, 0], target[:, 5].clamp(0.0, 1.0)),
@@ -198,16 +193,4 @@ def augmented(image: Tensor, target: Tensor, spare_rel: float) -> tuple[Tensor, 
 
 def to_onnx(network: CropNet) -> bytes:
     """The network as an ONNX file for any number of boxes; the normalisation is in the weights."""
-    file = io.BytesIO()
-    whole = copy.deepcopy(network).cpu().eval().float()
-    torch.onnx.export(
-        whole,
-        (torch.zeros(2, 3, WINDOW[1], WINDOW[0]),),
-        file,
-        input_names=[INPUT],
-        output_names=[OUTPUT],
-        dynamic_axes={INPUT: {0: "boxes"}, OUTPUT: {0: "boxes"}},
-        opset_version=17,
-        dynamo=False,
-    )
-    return file.getvalue()
+    return onnx_file(network, torch.zeros(2, 3, WINDOW[1], WINDOW[0]), INPUT, (OUTPUT,), "boxes")
