@@ -35,9 +35,10 @@ SIGMA_Z_M, SIGMA_TILT_RAD = 0.15, 0.03  # of a car on a road that another drive 
 ITERATIONS = 12
 NARROWER = 3.0  # by which the weights' bell shrinks from one iteration to the next
 NARROWEST = 9.0  # its width at the end, as a chi-square
-# For residuals as foreseen the weighed mean of chi-square is 1.49, and the covariance .81 of the weighed system's (the
-# asymptotic variance of an M-estimator, Huber 1981); of larger ones both grow
-MEAN_CHI2, EFFICIENCY = 1.4911, 0.8105
+# For residuals as foreseen the weighed mean of chi-square is 1.49, and the covariance .60 of the inverse of
+# the cost's curvature (the asymptotic variance of an M-estimator, Huber 1981); of larger ones both grow
+MEAN_CHI2, EFFICIENCY = 1.4911, 0.6043
+LEAST_CURVATURE = 0.05  # of what the weighed system has: less is no minimum
 OTHER_VIEW_PX = 1.0  # 1-sigma of a corner found anew from another place and at another time, besides its own noise
 
 
@@ -57,9 +58,9 @@ class LocalMap:
         back = inverse(keyframe.T_map)
         for other in (keyframe, *neighbours):
             T = back @ other.T_map
-            points.append(other.points_m @ T[:3, :3].T + T[:3, 3])
-            from_camera = other.points_m - np.array([0.0, 0.0, other.camera_height_m])
-            along.append((from_camera * other.sigma_depth_rel[:, None]) @ T[:3, :3].T)
+            from_camera = other.from_camera_m @ T[:3, :3].T
+            points.append(from_camera + T[:3, 3] + other.camera_height_m * T[:3, 2])
+            along.append(from_camera * other.sigma_depth_rel[:, None])
             descriptors.append(other.descriptors)
         return LocalMap(keyframe, np.concatenate(points), np.concatenate(along), np.concatenate(descriptors))
 
@@ -79,6 +80,11 @@ class Fix:
     @property
     def T_map_ego(self) -> SE2:
         return self.keyframe.T_map_keyframe @ self.T_keyframe_ego
+
+    @property
+    def in_odometry(self) -> SE2:
+        """T_keyframe_ego in metres of the odometry that made the keyframe."""
+        return self.T_keyframe_ego.scaled(1.0 / self.keyframe.scale)
 
     def attitude_in_map(self, camera: Camera) -> Attitude:
         """Of the ego, with the keyframe's own."""
@@ -193,9 +199,10 @@ def _adjust(
         W = np.linalg.inv(noise[:, None, None] * np.eye(2) + blur[:, :, None] * blur[:, None, :])
         error = xy - predicted
         chi2 = (error * (W @ error[:, :, None])[:, :, 0]).sum(axis=1)
-        good = (chi2 < GATE**2) & (p[:, 2] > 0.5)
+        ahead = p[:, 2] > 0.5
+        good = (chi2 < GATE**2) & ahead
         width = max(min(width / NARROWER, float(np.median(chi2))), NARROWEST)
-        weight = (p[:, 2] > 0.5) / (1.0 + chi2 / width) ** 2
+        weight = ahead / (1.0 + chi2 / width) ** 2
         weighed = (weight[:, None, None] * (W @ J)).reshape(-1, 6)
         H = weighed.T @ J.reshape(-1, 6)
         g = weighed.T @ error.ravel()
@@ -214,7 +221,20 @@ def _adjust(
         return None
     h = camera.height_m
     J_foot = np.array([[1, 0, 0, 0, h, 0], [0, 1, 0, -h, 0, 0], [0, 0, 0, 0, 0, 1]])  # the foot, by a step of the body
-    cov: Floats = J_foot @ np.linalg.inv(H) @ J_foot.T
+    # The curvature of the cost, not of the weighed system: where matches contradict each other there are other minima
+    # near, and the cost is flat (the observed information, Efron and Hinkley 1978)
+    gradients = (J.transpose(0, 2, 1) @ (W @ error[:, :, None]))[:, :, 0]
+    falls = ahead * 4.0 / width / (1.0 + chi2 / width) ** 3  # of each weight, by its residual
+    cov: Floats = J_foot @ _inverse(H, (gradients * falls[:, None]).T @ gradients) @ J_foot.T
     # The a posteriori variance of unit weight: residuals of an image with few right matches are larger than foreseen
     cov *= EFFICIENCY * max(1.0, float((weight * chi2).sum() / weight.sum()) / MEAN_CHI2)
     return pose, cov, good
+
+
+def _inverse(H: Floats, less: Floats) -> Floats:
+    """Of H - less, whose eigenvalues by those of H are at least LEAST_CURVATURE."""
+    root = np.linalg.inv(np.linalg.cholesky(H))
+    curvature, axes = np.linalg.eigh(np.eye(len(H)) - root @ less @ root.T)
+    back = root.T @ axes
+    out: Floats = back @ np.diag(1.0 / np.maximum(curvature, LEAST_CURVATURE)) @ back.T
+    return out

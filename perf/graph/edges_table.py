@@ -17,9 +17,9 @@ ABOUT = (
 )
 ABOUT_TABLE = (
     "ATE in m of the ego and of the mean car, nothing aligned; NEES over its degrees of freedom (1: honest), the ego's "
-    "of its pose in the world, a car's of its place in the ego's frame. *Beside the truth's axes*: the ego's with 6 mrad "
-    "(1-sigma, for a whole drive) by which KITTI's axes are turned against the way. Of simulated drives the mean and "
-    "the spread over draws."
+    "of its pose in the world, a car's of its place in the ego's frame. *Beside the truth's axes*: the ego's with 6 "
+    "mrad (1-sigma, for a whole drive) by which KITTI's axes are turned against the way. Of simulated drives the mean "
+    "and the spread over draws."
 )
 
 

@@ -22,8 +22,8 @@ _EVEN_RAD, _EVEN_STEPS = 3e-5, 4
 _DRIVES_M = 0.05  # in one step: a standing camera turns evenly as well
 ACCELERATION_MPS2 = 15.0  # no car changes its speed faster
 _STRAIGHT_PER_M, _STRAIGHT_M, _STEP_M = 0.003, 10.0, 0.3  # curvature of a straight road; its least way; of a step
-# 1-sigma of the angle from the axes of poses by GPS/IMU to their way, from drive to drive: `axes_off_way` is +12, +2 mrad
-# of KITTI odometry 00, 06 and -7, -9, -6, +3, +2, -3, +1, -4, -4 of tracking 0001-0006, 0008, 0010, 0018
+# 1-sigma of the angle from the axes of poses by GPS/IMU to their way, from drive to drive: `axes_off_way` is +12, +2
+# mrad of KITTI odometry 00, 06 and -7, -9, -6, +3, +2, -3, +1, -4, -4 of tracking 0001-0006, 0008, 0010, 0018
 AXES_SIGMA_RAD = 0.006
 
 
