@@ -155,6 +155,12 @@ def test_what_is_written_opens_elsewhere(tmp_path: Path) -> None:
     assert len(gpxpy.parse((tmp_path / "ego.gpx").read_text()).tracks[0].segments[0].points) == len(poses)
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_drive_without_places_has_nothing_beside_them(tmp_path: Path) -> None:
+    write_places(tmp_path, [])
+    assert write_around(tmp_path) == []
+
+
 def test_road_and_tracks_lie_beside_the_way_on_earth(tmp_path: Path) -> None:
     """A line 2 m left of the way and a car 10 m ahead, by an odometry that bends away by metres."""
     true, nodes, _ = way(1500.0, seed=6)
