@@ -104,9 +104,15 @@ def mapping(place: Path, road: Path, kept: bytes) -> Iterator[tuple[Run, Planner
 
 
 def in_map(planner: Planner, enough: Callable[[InMap], bool], what: str) -> InMap:
-    """The newest estimate in the map, once it is as asked."""
-    until(lambda: enough(planner.in_map()), what)
-    return planner.in_map()
+    """An estimate in the map that is as asked; the next one may be so no more."""
+    seen: list[InMap] = []
+
+    def asked() -> bool:
+        seen.append(planner.in_map())
+        return enough(seen[-1])
+
+    until(asked, what)
+    return seen[-1]
 
 
 def hears(planner: Planner, frames: int) -> None:
@@ -168,8 +174,14 @@ def test_nobody_notices_that_the_map_process_dies_stalls_and_has_a_full_disk(
             )
         limit = path.stat().st_size - 5_000  # no file of its process may grow past it: its log may, the map may not
         resource.prlimit(run.node_pid("map"), resource.RLIMIT_FSIZE, (limit, limit))
-        whole, saved = path.read_bytes(), len(read_map(path))
-        in_map(planner, lambda here: here.pose is not None and here.pose.keyframes > saved, "the map has grown")
+        newest, saved = planner.in_map().pose, len(read_map(path))
+        assert newest is not None
+        in_map(
+            planner,
+            lambda here: here.pose is not None and here.pose.frame_id > newest.frame_id and here.pose.keyframes > saved,
+            "the map has grown",
+        )
+        whole = path.read_bytes()  # what was being saved when the limit came is in it
         out = run.stop()
     assert "map was killed by SIGKILL" in out
     assert "map is stalled: its loop has shown no life" in out
