@@ -1,7 +1,8 @@
 """What a release uploads, the same bytes for whoever has the commit: python .ci/dist.py DIR (`make dist`).
 
 Wheel and source distribution of the committed tree, built twice and compared; what they need, as CycloneDX, of an
-environment with the wheel alone; the SHA-256 of each. Raises where anything is not committed, or the bytes differ.
+environment with the wheel alone; the SHA-256 of each. Raises where anything is not committed, the bytes differ, or the
+version's tag is another commit.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import subprocess
 import sys
 import tarfile
 import tempfile
+import tomllib
 import venv
 from pathlib import Path
 
@@ -71,10 +73,21 @@ def bill_of_materials(wheel: Path, folder: Path) -> bytes:
     return out.read_bytes()
 
 
+def release(version: str) -> str:
+    """What is built, for a person: a version is its tag. Raises where that is another commit's."""
+    tag = f"v{version}"
+    if tag in call("git", "tag", "--points-at", "HEAD").split():
+        return f"the release {tag}"
+    if call("git", "tag", "--list", tag).strip():
+        raise SystemExit(f"{tag} is another commit: raise `version` in pyproject.toml, or check out the tag")
+    return f"no release: this commit has no tag {tag}"
+
+
 def main(target: Path) -> None:
     """Writes it all into a folder."""
     if call("git", "status", "--porcelain"):
         raise SystemExit("what is not committed is in no release: commit it, or stash it")
+    what = release(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"])
     epoch = call("git", "log", "-1", "--format=%ct").strip()
     with tempfile.TemporaryDirectory() as name:
         place = Path(name)
@@ -93,6 +106,7 @@ def main(target: Path) -> None:
     lines = [f"{hashlib.sha256(path.read_bytes()).hexdigest()}  {path.name}" for path in sorted(target.iterdir())]
     (target / "SHA256SUMS").write_text("\n".join(lines) + "\n")
     print("\n".join(lines))
+    print(what)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ set -eu
 prefix=/opt/birdslam
 etc=/etc/birdslam
 units=/etc/systemd/system
-services="birdslam.service birdslam-gate.service birdslam-uplink.service birdslam-router.service"
+services="birdslam.service birdslam-gate.service birdslam-uplink.service birdslam-router.service birdslam-ros.service"
 source=$(cd "$(dirname "$0")/.." && pwd)
 python=${PYTHON:-/usr/bin/python3}
 

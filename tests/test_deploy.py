@@ -25,7 +25,7 @@ pytestmark = pytest.mark.processes
 __all__ = ["drive"]  # a fixture
 
 DEPLOY = ROOT / "deploy"
-UNITS = ("birdslam.service", "birdslam-gate.service", "birdslam-uplink.service", "birdslam-router.service")
+UNITS = tuple(f"birdslam{name}.service" for name in ("", "-gate", "-uplink", "-router", "-ros"))
 EXPOSURE_AT_MOST = 2.0
 SYSTEMD_ANALYZE, SHELLCHECK = shutil.which("systemd-analyze"), shutil.which("shellcheck")
 UNIT_TEXT = (DEPLOY / "birdslam.service").read_text()

@@ -17,7 +17,7 @@ import pytest
 
 from birdslam.bench.simulation.places import CAMERA
 from birdslam.geometry.se2 import SE2
-from birdslam.loops.drift import moved
+from birdslam.loops.drift import link_cov
 from birdslam.loops.gnss.earth import EarthError, GnssFix, place_on_earth
 from birdslam.loops.gnss.factors import Node, OnEarth, fixed_keyframes, tie
 from birdslam.loops.gnss.sentences import NmeaReader
@@ -43,7 +43,7 @@ def way(length_m: float, seed: int) -> tuple[list[SE2], list[Node], list[Link]]:
         seen = SE2(
             step.x_m * 1.01, 0.02 * chance.standard_normal(), step.yaw_rad + 2e-4 + 1e-3 * chance.standard_normal()
         )
-        links.append(Link(number - 1, number, seen, moved(np.zeros((3, 3)), seen)))
+        links.append(Link(number - 1, number, seen, link_cov(seen, 0.0)))
         here.append(Node(number, here[-1].T_map_keyframe @ seen))
     return true, here, links
 
@@ -124,7 +124,7 @@ def test_a_place_on_earth_is_within_its_covariance() -> None:
     for seed in range(12):
         true, nodes, links = way(400.0, seed)
         found = tied(true, nodes, links, fixes_of(true, 1.5, seed=seed))
-        T, cov = found.poses[nodes[-1].number]
+        T, cov, _ = found.poses[nodes[-1].number]
         here = found.earth.pose(T, cov)
         east, north, _ = pymap3d.geodetic2enu(here.latitude_deg, here.longitude_deg, 0.0, *ORIGIN, 0.0)
         error = np.array([east - true[-1].x_m, north - true[-1].y_m])
@@ -153,6 +153,12 @@ def test_what_is_written_opens_elsewhere(tmp_path: Path) -> None:
     lon, lat = features.features[0].geometry.coordinates[0]
     assert (lat, lon) == pytest.approx(ORIGIN, abs=1e-4)
     assert len(gpxpy.parse((tmp_path / "ego.gpx").read_text()).tracks[0].segments[0].points) == len(poses)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_drive_without_places_has_nothing_beside_them(tmp_path: Path) -> None:
+    write_places(tmp_path, [])
+    assert write_around(tmp_path) == []
 
 
 def test_road_and_tracks_lie_beside_the_way_on_earth(tmp_path: Path) -> None:

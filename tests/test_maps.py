@@ -27,10 +27,11 @@ from birdslam.loops.place_map import MapCamera, PlaceMap
 from birdslam.loops.session import MapSession
 from birdslam.loops.verification import locate
 from birdslam.outputs.map_trajectory import MapTrajectory, TrajectoryFiles
+from birdslam.perf.maps import scale_drift
 from birdslam.runtime.batch.one_map import DRIVE_MAP, join
 from birdslam.runtime.cli.commands import parse
 from birdslam.runtime.configuration import ConfigurationError, load
-from birdslam.runtime.maps import map_drive
+from birdslam.runtime.maps import held_way, map_drive
 from birdslam.runtime.maps.map_drive import MapChoice
 from birdslam.runtime.maps.map_store import read_map, write_map
 from birdslam.types import Attitude
@@ -305,9 +306,37 @@ def test_keyframes_tied_by_loops_that_are_switched_off_stay_where_they_are() -> 
     ]  # the last three are a chain of their own
     cov = np.diag([1e-4, 1e-4, 1e-6])
     far = [Link(first.number, last.number, SE2(1e4 * sign, 5.0, 0.5), cov, loop=True) for sign in (1.0, -1.0)]
-    at, at_cov = close_loops(place_map.keyframes, [*links, *far])[last.number]
+    at, at_cov, _ = close_loops(place_map.keyframes, [*links, *far])[last.number]
     assert np.hypot(*last.T_map_keyframe.between(at).log()[:2]) < 1.0
     assert at_cov[0, 0] > 1e3  # nothing says where it is
+
+
+def test_a_scale_that_drifts_while_it_is_carried_is_taken_out_by_closing_the_loop() -> None:
+    """Each keyframe is within its sigma of the truth; in SE(2), with the same links as wide as their scale, not."""
+    drive_ = scale_drift.carried(seed=1, drift=0.06)
+    off, sigma = scale_drift.in_sim2(*drive_)
+    off_se2, sigma_se2 = scale_drift.in_se2(*drive_)
+    assert (np.abs(off) < 2.0 * sigma).mean() > 0.95
+    assert (np.abs(off) < 3.0 * sigma).all()
+    assert (np.abs(off_se2) < 2.0 * sigma_se2).mean() < 0.9
+    assert np.abs(off).max() < 0.6 * np.abs(off_se2).max()
+
+
+def test_points_of_a_keyframe_are_as_long_as_its_scale_says(mapped: bytes) -> None:
+    place_map = decode_map(mapped)
+    true = decode_map(mapped)
+    place_map.keyframes = [
+        replace(
+            each,
+            scale=0.95,
+            points_m=(each.points_m - (0, 0, each.camera_height_m)) / 0.95 + (0, 0, each.camera_height_m),
+        )
+        for each in place_map.keyframes
+    ]
+    place_map = decode_map(encode_map(place_map))
+    for a, b in zip(place_map.keyframes, true.keyframes, strict=True):
+        np.testing.assert_allclose(a.from_camera_m, b.from_camera_m, atol=0.011)  # a file has centimetres
+    np.testing.assert_array_less(np.abs(errors(driven(place_map, STREET, range(20, 60), seed=6))[:, :2]), 0.5)
 
 
 # --- the file ---
@@ -339,7 +368,7 @@ def test_what_is_no_whole_map_is_refused(mapped: bytes) -> None:
         (mapped[:16], "cut off"),
         (mapped[:-100], "torn"),
         (bytes(flipped), "CRC"),
-        (newer, "version 4"),
+        (newer, "version 5"),
         (MAGIC + HEAD.pack(version, 1, zlib.crc32(b"\xc1")) + b"\xc1", "something that is no map"),
     ):
         with pytest.raises(MapError, match=why):
@@ -543,7 +572,7 @@ def test_the_commands(files: dict[str, Path], tmp_path: Path, capsys: pytest.Cap
 
 
 def test_what_is_kept_of_a_long_drive_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(map_drive, "MOST_POSES", 16)
+    monkeypatch.setattr(held_way, "MOST_POSES", 16)
     driving = map_drive.MapDrive(MapChoice(tmp_path / "new.map", extend=True), CAMERA, tmp_path)
     estimates = [estimate for estimate, _, _ in drive(STREET, range(100), 3)]
     for estimate in estimates:

@@ -99,6 +99,24 @@ def test_an_interpolated_truth_is_found_and_left_out() -> None:
     assert report.frames.nees > 1.0 > 0.1 > report.frames.nees_measured
 
 
+def test_axes_that_are_turned_against_the_way_are_measured_on_straight_road_and_count_as_the_truths() -> None:
+    rng = np.random.default_rng(7)
+    off_rad = 0.012
+    turn = [2e-4 * rng.standard_normal() for _ in range(200)]
+    true = [SE2(0.9, 0.0, yaw) for yaw in turn]
+    turned = SE2(0.0, 0.0, -off_rad)  # the same places, and axes to the right of the car's
+    poses = drive([turned.inverse() @ step @ turned for step in true])
+    assert truth_quality.axes_off_way(poses, MOUNT) == pytest.approx(off_rad, abs=1e-3)
+    small = np.diag([1e-4, 2e-6, 1e-6])
+    erring = [step @ SE2.exp(np.sqrt(np.diag(small)) * rng.standard_normal(3)) for step in true]
+    report = judged(told(erring, small), poses)
+    assert report.truth_axes_off_rad == pytest.approx(off_rad, abs=1e-3)
+    assert report.frames.nees is not None
+    assert report.frames.nees_measured is not None
+    assert report.frames.nees > 5.0 > 3.0 > report.frames.nees_measured > 0.5
+    assert truth_quality.axes_off_way(drive([SE2(0.9, 0.0, 0.05)] * 200), MOUNT) is None  # a roundabout
+
+
 def test_a_standing_cars_truth_is_no_interpolation() -> None:
     assert not truth_quality.interpolated(drive([SE2(0.001, 0.0, 0.0)] * 50)).any()
 

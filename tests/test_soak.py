@@ -38,6 +38,16 @@ def test_a_flat_drive_is_well(systemd: Systemd) -> None:
     assert row.endswith("| 0 | 3 |")
 
 
+def test_what_a_start_makes_once_is_not_carried_on(systemd: Systemd) -> None:
+    rng = np.random.default_rng(3)
+    warm = series([*np.linspace(100.0, 100.8, 60), *(100.8 + 0.01 * rng.normal(size=60))], [30] * 120)
+    assert list(faults({"map": warm}, WELL, systemd)) == []
+    slow = series([100.0 + 0.005 * k + 0.01 * noise for k, noise in enumerate(rng.normal(size=120))], [30] * 120)
+    (said,) = faults({"map": slow}, WELL, systemd)  # half a percent in ten minutes
+    assert said.startswith("map would grow by 2")
+    assert said.endswith("in 8 hours")
+
+
 @pytest.mark.parametrize(
     ("one", "said"),
     [

@@ -100,6 +100,12 @@ def focal_by_field_of_view(width_px: int, degrees: float, fisheye: bool = False)
     return 0.5 * width_px / (half_rad if fisheye else math.tan(half_rad))
 
 
+def k1_by_bend(bend: tuple[float, float], focal: float) -> tuple[float, float]:
+    """k1 and its 1-sigma by upright lines, and by what is known beforehand; the focal length in image widths."""
+    by_lines, by_kind = (bend[1] * focal**2) ** -2.0, SIGMA_K1**-2.0
+    return bend[0] * focal**2 * by_lines / (by_lines + by_kind), (by_lines + by_kind) ** -0.5
+
+
 def followed_corners(images: Iterable[tuple[NDArray[np.uint8], Floats]], camera: Camera) -> list[CornersOfImage]:
     """Corners of a camera's raw images, followed from each to the next, outside the boxes (B, 4) of vehicles in each.
 
@@ -130,24 +136,29 @@ def self_calibrate(
     focal_sigma_rel: float,
     by_view: bool = False,
     fisheye: bool = False,
+    bend: tuple[float, float] | None = None,
 ) -> Lens | None:
     """The lens that the corners of a drive's raw images show; None where there is too little to see.
 
     `focal_px` with its 1-sigma is what is known beforehand. Where it is `by_view` across the image, nobody knows
     whether the view was counted with the lens's distortion or without: the sigma covers both. The focal length trades
-    against turns and lateral motion in a narrow valley: so it is looked for from several.
+    against turns and lateral motion in a narrow valley: so it is looked for from several. `bend`: that of a pinhole by
+    upright lines (uprights.py), with its 1-sigma.
     """
+    k1_before = 0.0, SIGMA_K1
+    if bend is not None and not fisheye:
+        k1_before = k1_by_bend(bend, focal_px / size_px[0])
     middle = 0.5 * (np.array(size_px, dtype=np.float64) - 1.0)
     windows: list[_Window] = []
     for step_rad in _STEPS_RAD:
         if len(windows) < 2 * _LEAST_WINDOWS:
             windows = _windows(images, middle, step_rad * focal_px)
     sigma_px = _SIGMA_PX * focal_px / _FOCAL_PX
-    begun = _begin(windows, focal_px, 0.0, sigma_px, fisheye)
+    begun = _begin(windows, focal_px, k1_before[0], sigma_px, fisheye, k1_before)
     if begun is None:
         return None
     fitted = adjust(begun)
-    again = _begin(windows, focal_px, fitted.k1, sigma_px, fisheye)
+    again = _begin(windows, focal_px, fitted.k1, sigma_px, fisheye, k1_before)
     fitted = fitted if again is None else adjust(again)
     if by_view:
         half = 0.5 * size_px[0] / focal_px
@@ -164,7 +175,7 @@ def self_calibrate(
         focal_px=math.exp(fitted.log_focal),
         k1=fitted.k1,
         focal_sigma_rel=max(float(sigmas[1]), LEAST_SIGMA_REL) if shown else focal_sigma_rel,
-        k1_sigma=min(max(LEAST_SIGMA_K1, float(sigmas[0])), SIGMA_K1),
+        k1_sigma=min(max(LEAST_SIGMA_K1, float(sigmas[0])), k1_before[1]),
         windows=len(fitted.R),
         corners=len(fitted.px),
         turned_rad=turned_rad,
@@ -184,7 +195,7 @@ def _with_focal_length(windows: Sequence[_Window], fitted: LensProblem, prior: F
     found = [adjust(problem, prior, _ROUGHLY) for problem in begun]
     best = min(found, key=lambda problem: cost_of(problem, prior))
     # Which corners are outliers was decided with another lens
-    again = _begin(windows, math.exp(best.log_focal), best.k1, best.sigma_px, best.fisheye)
+    again = _begin(windows, math.exp(best.log_focal), best.k1, best.sigma_px, best.fisheye, best.k1_before)
     return best if again is None else adjust(again, prior)
 
 
@@ -281,7 +292,12 @@ def _undistorted(px: Floats, focal_px: float, k1: float, fisheye: bool) -> Float
 
 
 def _begin(
-    windows: Sequence[_Window], focal_px: float, k1: float, sigma_px: float, fisheye: bool
+    windows: Sequence[_Window],
+    focal_px: float,
+    k1: float,
+    sigma_px: float,
+    fisheye: bool,
+    k1_before: tuple[float, float],
 ) -> LensProblem | None:
     """Poses and corners of each window, by its first and last image and by resection of those between."""
     px, of, corner = [], [], []
@@ -309,6 +325,7 @@ def _begin(
         k1,
         sigma_px,
         fisheye,
+        k1_before,
     )
 
 

@@ -40,6 +40,7 @@ class LensProblem:
     k1: float
     sigma_px: float  # of a corner: a larger image has it in more pixels, whatever its lens turns out to be
     fisheye: bool = False  # the radius grows with the angle from the axis, and not with its tangent
+    k1_before: tuple[float, float] = (0.0, SIGMA_K1)  # what is known of k1 beside the corners, with its 1-sigma
 
     @property
     def shared(self) -> Floats:
@@ -68,6 +69,7 @@ def at_focal_length(problem: LensProblem, log_focal: float) -> LensProblem:
         t=problem.t * [by, by, 1.0],
         corner=problem.corner * [by, by, 1.0],
         k1=problem.k1 / by**2,
+        k1_before=(problem.k1_before[0] / by**2, problem.k1_before[1]),
         log_focal=log_focal,
     )
 
@@ -175,7 +177,8 @@ def _linearise(problem: LensProblem, prior: FocalPrior | None) -> tuple[float, _
     d, d_u, d_k1 = _distorted(problem, u)
     r, weight, each = _huber(problem, q, d)
     focal_px, sigma_px = math.exp(problem.log_focal), problem.sigma_px
-    known = np.array([0.0, prior.log_focal]), np.array([SIGMA_K1, prior.sigma]) ** -2.0
+    k1, sigma_k1 = problem.k1_before
+    known = np.array([k1, prior.log_focal]), np.array([sigma_k1, prior.sigma]) ** -2.0
     away = problem.shared - known[0]
     cost = float(each.sum()) + 0.5 * float(known[1] @ away**2)
 

@@ -61,6 +61,10 @@ class SE2(msgspec.Struct, frozen=True, array_like=True, gc=False):
         c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
         return SE2(-c * self.x_m - s * self.y_m, s * self.x_m - c * self.y_m, wrap(-self.yaw_rad))
 
+    def scaled(self, factor: float) -> SE2:
+        """The same in another unit of length: `factor` of the new unit is one of the old."""
+        return SE2(factor * self.x_m, factor * self.y_m, self.yaw_rad)
+
     def between(self, other: SE2) -> SE2:
         """`T_a_b` of `self = T_w_a` and `other = T_w_b`."""
         return self.inverse() @ other

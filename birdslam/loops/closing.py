@@ -1,26 +1,38 @@
-"""Loops closed, and fixes of GNSS taken in: the graph of keyframes in SE(2), solved by gtsam.
+"""Loops closed, and fixes of GNSS taken in: the graph of keyframes in Sim(2), solved by gtsam.
 
-Loops are weighed by dynamic covariance scaling (Agarwal et al. 2013), the closed form of switchable constraints: one
-that contradicts the rest is switched off. Which fixes are outliers graduated non-convexity says (Yang et al. 2020):
-odometry's links are held, and fixes that can't all be true with them are left out. gtsam is loaded only where there is
-something to solve.
+Each keyframe has a pose in the map and a scale, the map's metres over those of its odometry (Strasdat et al. 2010).
+Links measure in the metres of the keyframe that they begin at. Loops are weighed by dynamic covariance scaling (Agarwal
+et al. 2013), the closed form of switchable constraints: one that contradicts the rest is switched off. Which fixes are
+outliers graduated non-convexity says (Yang et al. 2020): those that can't all be true with odometry's links.
 """
 
 from __future__ import annotations
 
+import math
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from birdslam.geometry.arrays import Bools, Floats
 from birdslam.geometry.se2 import SE2
+from birdslam.loops.drift import KEPT_M, LEAST_SCALE_REL
 from birdslam.loops.keyframe import Link, Placed
 
 DCS_PHI = 5.0  # chi-square at which a loop begins to count less
-ORIGIN_SIGMA = 1e-3, 1e-3, 1e-4  # the map's frame is that of its first keyframe
-LOOSE_SIGMA = 1e3, 1e3, 1e1  # of keyframes that only loops, or nothing, tie to the first: a loop may be switched off
+# x, y, yaw, and the scale's logarithm
+ORIGIN_SIGMA = 1e-3, 1e-3, 1e-4, 1e1  # the map's frame is that of its first keyframe
+LOOSE_SIGMA = (
+    1e3,
+    1e3,
+    1e1,
+    1e-1,
+)  # of keyframes that only loops, or nothing, tie to the first: a loop may be switched off
+FREE_SIGMA = 1e6  # of what a prior says nothing of
+LOOP_SCALE_SIGMA = 1e1  # a place that is seen again tells nothing of odometry's metres there
+LEAST_WAY_M = 0.1  # of a link, over which the scale may change
 GNC_COST = 0.5 * 11.3  # half the chi-square beyond which a factor is an outlier: 99 % of three degrees of freedom
 
 
@@ -34,41 +46,42 @@ class PlaceFactor:
     weighed_m: float  # and with what it shares with those around it, by which it pulls
 
 
-def close_loops(
-    keyframes: Sequence[Placed], links: Sequence[Link], fixes: Sequence[PlaceFactor] = ()
-) -> dict[int, tuple[SE2, Floats]]:
-    """Each keyframe's pose and its covariance, by number, with all links and fixes at once.
+class Solved(NamedTuple):
+    """Where a keyframe is in the solved graph."""
 
-    Without fixes the first keyframe stays where it is; with them all may move.
+    T_map_keyframe: SE2
+    cov: Floats  # (3, 3) of the tangent at the pose
+    scale: float  # metres of the map over those of its odometry
+
+
+def close_loops(
+    keyframes: Sequence[Placed], links: Sequence[Link], fixes: Sequence[PlaceFactor] = (), agreed: bool = False
+) -> dict[int, Solved]:
+    """Each keyframe by its number, with all links and fixes at once.
+
+    Without fixes the first keyframe stays where it is; with them all may move. `agreed`: the loops are known to agree
+    with each other, and may lie far from where the keyframes are now; others that do are switched off.
     """
     import gtsam  # here: only who closes a loop needs it
 
     if not keyframes:
         return {}
-    graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    tied = _tied(keyframes[0].number, links)
-    first = ORIGIN_SIGMA if not fixes else LOOSE_SIGMA
-    for keyframe in keyframes:
-        pose = _pose2(keyframe.T_map_keyframe)
-        start.insert(keyframe.number, pose)
-        if keyframe is keyframes[0] or keyframe.number not in tied:
-            sigmas = np.array(first if keyframe is keyframes[0] else LOOSE_SIGMA)
-            graph.add(gtsam.PriorFactorPose2(keyframe.number, pose, gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
-    robust = gtsam.noiseModel.mEstimator.DCS(DCS_PHI)
-    for link in links:
-        noise = _noise(link)
-        if link.loop:
-            noise = gtsam.noiseModel.Robust.Create(robust, noise)
-        graph.add(gtsam.BetweenFactorPose2(link.from_number, link.to_number, _pose2(link.T_from_to), noise))
+    first_sigma = LOOSE_SIGMA if fixes else ORIGIN_SIGMA
+    graph, start = _graph(keyframes, links, first_sigma, gtsam.noiseModel.mEstimator.DCS(DCS_PHI))
+    if agreed:
+        start = gtsam.LevenbergMarquardtOptimizer(_graph(keyframes, links, first_sigma)[0], start).optimize()
     for fix in fixes:
-        graph.add(_place_factor(fix, fix.weighed_m))
+        graph.add(_place_factor(fix, fix.weighed_m, start))
     found = gtsam.LevenbergMarquardtOptimizer(graph, start).optimize()
     marginals = gtsam.Marginals(graph, found)
     out = {}
     for keyframe in keyframes:
-        pose = found.atPose2(keyframe.number)
-        cov = np.array(marginals.marginalCovariance(keyframe.number))
-        out[keyframe.number] = SE2(pose.x(), pose.y(), pose.theta()), cov
+        solved = found.atSimilarity2(keyframe.number)
+        scale = float(solved.scale())
+        x_m, y_m = scale * np.array(solved.translation())
+        in_map = np.diag([scale, scale, 1.0])  # its tangent is in the keyframe's own metres
+        cov = in_map @ np.array(marginals.marginalCovariance(keyframe.number))[:3, :3] @ in_map
+        out[keyframe.number] = Solved(SE2(float(x_m), float(y_m), solved.rotation().theta()), cov, scale)
     return out
 
 
@@ -76,20 +89,10 @@ def inliers(keyframes: Sequence[Placed], links: Sequence[Link], fixes: Sequence[
     """(N,) whether each fix fits the others and odometry."""
     import gtsam  # here: only who has fixes needs it
 
-    graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    loose = gtsam.noiseModel.Diagonal.Sigmas(np.array(LOOSE_SIGMA))
-    tied = _tied(keyframes[0].number, links)
-    for keyframe in keyframes:
-        pose = _pose2(keyframe.T_map_keyframe)
-        start.insert(keyframe.number, pose)
-        if keyframe is keyframes[0] or keyframe.number not in tied:
-            graph.add(gtsam.PriorFactorPose2(keyframe.number, pose, loose))
-    ordered = sorted(links, key=lambda link: link.loop)  # what is held comes first
-    for link in ordered:
-        graph.add(gtsam.BetweenFactorPose2(link.from_number, link.to_number, _pose2(link.T_from_to), _noise(link)))
+    graph, start = _graph(keyframes, links, LOOSE_SIGMA)
     size = graph.size()
     for fix in fixes:
-        graph.add(_place_factor(fix, fix.sigma_m))
+        graph.add(_place_factor(fix, fix.sigma_m, start))
     params = gtsam.GncLMParams()
     params.setKnownInliers(list(range(size - sum(link.loop for link in links))))
     solver = gtsam.GncLMOptimizer(graph, start, params)
@@ -99,25 +102,86 @@ def inliers(keyframes: Sequence[Placed], links: Sequence[Link], fixes: Sequence[
     return out
 
 
-def _noise(link: Link) -> Any:
+def _graph(
+    keyframes: Sequence[Placed], links: Sequence[Link], first_sigma: tuple[float, ...], robust: Any = None
+) -> tuple[Any, Any]:
+    """Its factors, loops last, and where it starts from; loops weighed by `robust`."""
     import gtsam  # here: only who closes a loop needs it
 
-    return gtsam.noiseModel.Gaussian.Covariance(link.cov + 1e-12 * np.eye(3))
+    graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    tied, information = _tied(keyframes[0].number, links), _scale_information(links)
+    for keyframe in keyframes:
+        number, pose = keyframe.number, _similarity(keyframe.T_map_keyframe, keyframe.scale)
+        start.insert(number, pose)
+        if keyframe is keyframes[0] or number not in tied:
+            graph.add(_prior(number, pose, first_sigma if keyframe is keyframes[0] else LOOSE_SIGMA))
+        if number in information:  # odometry's metres are right in the mean
+            right = _similarity(keyframe.T_map_keyframe, 1.0)
+            graph.add(_prior(number, right, (FREE_SIGMA,) * 3 + (information[number] ** -0.5,)))
+    for link in sorted(links, key=lambda link: link.loop):
+        cov = 1e-12 * np.eye(4)
+        cov[:3, :3] += link.cov
+        cov[3, 3] = LOOP_SCALE_SIGMA**2 if link.loop else _scale_step(link)
+        noise: Any = gtsam.noiseModel.Gaussian.Covariance(cov)
+        if link.loop and robust is not None:
+            noise = gtsam.noiseModel.Robust.Create(robust, noise)
+        graph.add(
+            gtsam.BetweenFactorSimilarity2(link.from_number, link.to_number, _similarity(link.T_from_to, 1.0), noise)
+        )
+    return graph, start
 
 
-def _place_factor(fix: PlaceFactor, sigma_m: float) -> Any:
+def _scale_step(link: Link) -> float:
+    """Variance by which the scale's logarithm differs from one end of a link to the other.
+
+    With `_scale_information` at both ends it is the process of Ornstein and Uhlenbeck, exp(-way / KEPT_M), as large as
+    odometry says of itself.
+    """
+    sigma_rel, lasting = _scale_process(link)
+    return 2.0 * sigma_rel**2 * math.sinh(lasting)
+
+
+def _scale_information(links: Sequence[Link]) -> dict[int, float]:
+    """What odometry's own word tells of the logarithm of each keyframe's scale."""
+    out: dict[int, float] = defaultdict(float)
+    for link in links:
+        if not link.loop:
+            sigma_rel, lasting = _scale_process(link)
+            for number in (link.from_number, link.to_number):
+                out[number] += math.tanh(0.5 * lasting) / (2.0 * sigma_rel**2)
+    return out
+
+
+def _scale_process(link: Link) -> tuple[float, float]:
+    """Its 1-sigma, and the link's way in lengths over which the error lasts."""
+    way_m = max(math.hypot(link.T_from_to.x_m, link.T_from_to.y_m), LEAST_WAY_M)
+    return max(link.scale_rel, LEAST_SCALE_REL), min(way_m / KEPT_M, 20.0)
+
+
+def _prior(number: int, pose: Any, sigmas: tuple[float, ...]) -> Any:
+    import gtsam  # here: only who closes a loop needs it
+
+    return gtsam.PriorFactorSimilarity2(number, pose, gtsam.noiseModel.Diagonal.Sigmas(np.array(sigmas)))
+
+
+def _place_factor(fix: PlaceFactor, sigma_m: float, start: Any) -> Any:
+    """Turn and scale are those that the graph starts from, and free."""
     import gtsam  # here: only who has fixes needs it
 
-    return gtsam.PoseTranslationPrior2D(fix.number, np.array(fix.xy_m), gtsam.noiseModel.Isotropic.Sigma(2, sigma_m))
+    guess = start.atSimilarity2(fix.number)
+    scale = float(guess.scale())
+    place = gtsam.Similarity2(guess.rotation(), gtsam.Point2(*np.divide(fix.xy_m, scale)), scale)
+    return _prior(fix.number, place, (sigma_m / scale, sigma_m / scale, FREE_SIGMA, FREE_SIGMA))
 
 
-def held(links: Sequence[Link], poses: dict[int, tuple[SE2, Floats]]) -> list[Link]:
+def held(links: Sequence[Link], poses: dict[int, Solved]) -> list[Link]:
     """The links that the solved graph agrees with; loops that it contradicts are left out."""
     return [link for link in links if not link.loop or _chi2(link, poses) < 9.0 * DCS_PHI]
 
 
-def _chi2(link: Link, poses: dict[int, tuple[SE2, Floats]]) -> float:
-    between = poses[link.from_number][0].between(poses[link.to_number][0])
+def _chi2(link: Link, poses: dict[int, Solved]) -> float:
+    here, there = poses[link.from_number], poses[link.to_number]
+    between = here.T_map_keyframe.between(there.T_map_keyframe).scaled(1.0 / here.scale)
     error = link.T_from_to.between(between).log()
     return float(error @ np.linalg.solve(link.cov + 1e-12 * np.eye(3), error))
 
@@ -139,7 +203,8 @@ def _tied(first: int, links: Sequence[Link]) -> set[int]:
     return seen
 
 
-def _pose2(T: SE2) -> Any:
+def _similarity(T: SE2, scale: float) -> Any:
+    """gtsam takes p to scale * (R p + t)."""
     import gtsam  # here: only who closes a loop needs it
 
-    return gtsam.Pose2(T.x_m, T.y_m, T.yaw_rad)
+    return gtsam.Similarity2(gtsam.Rot2(T.yaw_rad), gtsam.Point2(T.x_m / scale, T.y_m / scale), scale)

@@ -20,6 +20,9 @@ DRIFT_REL, DRIFT_M, DRIFT_YAW_RAD = 0.02, 0.01, 0.0012
 INVALID_REL, INVALID_YAW_RAD_PER_M = 1.0, 0.02  # of a step that odometry itself calls invalid: any length, any bend
 LEAST_SCALE_REL = 0.012  # 1-sigma of its metric scale, where it calls it surer
 MOST_MPS2 = 10.0  # by which a car changes its velocity: its tyres hold no more
+# An error of odometry's scale lasts for CORRELATION_M of way, as in the window's graph, and a part of it for KEPT_M
+CORRELATION_M, KEPT_M = 20.0, 1000.0
+ACROSS_M, ALONG_M = 0.03, 0.01  # of a link, by the root of its way: direction (.005 rad for CORRELATION_M), the rest
 LOOP_SCALE_REL = 0.01  # by which the scale of odometry differs from one end of a way to the other
 LOOP_YAW_RAD = 0.0006
 
@@ -30,13 +33,16 @@ class Steps:
     def __init__(self) -> None:
         self._last: Estimate | None = None
         self._velocity_mps: tuple[float, float] | None = None  # of the last step, in its ego
-        self.sum_m2 = 0.0  # variance of all errors that `add` has found so far
+        self.sum_m2 = 0.0  # variance of all errors that `add` has found so far, and of the invalid steps
 
     def add(self, estimate: Estimate) -> float:
         """By how much the step that ends here is off for sure, in metres."""
         last, self._last = self._last, estimate
         before, self._velocity_mps = self._velocity_mps, None
-        if last is None or not estimate.valid:
+        if last is None:
+            return 0.0
+        if not estimate.valid:
+            self.sum_m2 += (INVALID_REL * math.hypot(*last.T_world_ego.between(estimate.T_world_ego).log()[:2])) ** 2
             return 0.0
         dt_s = (estimate.t_source_ns - last.t_source_ns) / NS_PER_S
         if dt_s <= 0.0:
@@ -63,6 +69,24 @@ def drift(step: SE2, valid: bool = True, scale_rel: float = 0.0, error_m: float 
         sigma_m += INVALID_REL * way_m
         yaw_rad += INVALID_YAW_RAD_PER_M * way_m + abs(step.yaw_rad)
     return np.diag([sigma_m**2, sigma_m**2, yaw_rad**2]) + 1e-10 * np.eye(3)
+
+
+def link_cov(step: SE2, scale_rel: float, unsure_m2: float = 0.0) -> Floats:
+    """(3, 3) covariance of a drive's own motion between two keyframes, apart from the part of its scale that is kept.
+
+    `unsure_m2`: variance of what is known to be wrong in it (`Steps`).
+    """
+    way_m = math.hypot(step.x_m, step.y_m)
+    scale_rel = max(scale_rel, LEAST_SCALE_REL)
+    along_m2 = (ALONG_M**2 + 2.0 * CORRELATION_M * scale_rel**2) * way_m  # as of independent steps, over a long way
+    yaw_rad = DRIFT_YAW_RAD * math.sqrt(way_m) + 0.02 * abs(step.yaw_rad)
+    yaw_rad2 = yaw_rad**2 + INVALID_YAW_RAD_PER_M**2 * unsure_m2
+    return np.diag([along_m2 + unsure_m2, ACROSS_M**2 * way_m + unsure_m2, yaw_rad2]) + 1e-10 * np.eye(3)
+
+
+def own_scale_rel(scale_rel: float, camera_rel: float) -> float:
+    """What odometry's sigma of its metres has besides the camera's height, which is the same all along a drive."""
+    return math.sqrt(max(scale_rel**2 - camera_rel**2, 0.0))
 
 
 def drift_after(way_m: float) -> Floats:

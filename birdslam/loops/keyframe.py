@@ -22,6 +22,8 @@ class Placed(Protocol):
     def number(self) -> int: ...
     @property
     def T_map_keyframe(self) -> SE2: ...
+    @property
+    def scale(self) -> float: ...
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,10 @@ class LinePiece:
 
 @dataclass(frozen=True, eq=False)
 class Keyframe:
-    """Points are in the keyframe's ego frame: x forward, y left, z up, metres, from the camera's foot on the road."""
+    """Points are in the keyframe's ego frame: x forward, y left, z up, from the camera's foot on the road.
+
+    They are in metres of its drive's odometry there; `scale` makes them the map's, about the camera that saw them.
+    """
 
     number: int  # unique in its map
     drive: int  # the drive that it is of: 0 made the map, further ones extended it
@@ -66,23 +71,34 @@ class Keyframe:
     camera_height_m: float
     gnss: Fixed | None = None
     lines: tuple[LinePiece, ...] = ()
+    scale: float = 1.0  # metres of the map over those of its odometry
+
+    @property
+    def from_camera_m(self) -> Floats:
+        """(N, 3) its points from its camera, in the car's axes and metres of the map."""
+        return self.scale * (self.points_m - np.array([0.0, 0.0, self.camera_height_m]))
 
     @property
     def T_map(self) -> Transform:
         """(4, 4) of the car's axes, in which its points are."""
         return body_pose(self.T_map_keyframe, self.attitude, self.camera_height_m)
 
-    def at(self, T_map_keyframe: SE2, cov: Floats | None = None) -> Keyframe:
+    def at(self, T_map_keyframe: SE2, cov: Floats | None = None, scale: float | None = None) -> Keyframe:
         """The same, elsewhere in the map: its points move along."""
-        return replace(self, T_map_keyframe=T_map_keyframe, cov=self.cov if cov is None else cov)
+        cov, scale = self.cov if cov is None else cov, self.scale if scale is None else scale
+        return replace(self, T_map_keyframe=T_map_keyframe, cov=cov, scale=scale)
 
 
 @dataclass(frozen=True)
 class Link:
-    """A drive's own motion between two keyframes that followed one another, or a place recognised."""
+    """A drive's own motion between two keyframes that followed one another, or a place recognised.
+
+    Both are in metres of the odometry of the keyframe that they begin at.
+    """
 
     from_number: int
     to_number: int
     T_from_to: SE2
-    cov: Floats  # (3, 3)
+    cov: Floats  # (3, 3); of a drive's own motion: apart from its scale
     loop: bool = False
+    scale_rel: float = 0.0  # 1-sigma of odometry's metres, by its own word; of its own motion

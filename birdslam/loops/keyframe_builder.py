@@ -40,6 +40,8 @@ class Look:
     T_odom_ego: SE2
     attitude: Attitude
     features: Features
+    scale_rel: float = 0.0  # 1-sigma of odometry's metres, apart from what the camera's height makes of all of them
+    unsure_m2: float = 0.0  # variance of odometry's steps so far that are known to be wrong
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,12 +35,13 @@ CHI2_GATE = 16.27  # of three degrees of freedom, 99.9 %
 FOLLOWED_M = 30.0  # of way since the last fix, along which the ego is looked for where odometry says
 FOLLOW_M = 12.0  # keyframes within it are looked for
 SEARCH_PX, MOST_SEARCH_PX = 25.0, 120.0
-FARTHEST_M = 1e5
+FARTHEST_M, LEAST_STEP_M = 1e5, 0.1
 # What fixes by one keyframe share, by how far the ego is from it along its axis and aside: its points were seen along
 # the way only, and what their depths have in common shows from aside. That the car tilts is no such error (foot.py),
 # nor that all metres of the map are too long
 ALONG_REL, ASIDE_REL = 0.006, 0.02
 SHARED_YAW_RAD, ASIDE_YAW_RAD_PER_M = 0.0003, 0.0007
+SAME_POINTS_M = 4.0  # of way, along which fixes see the same points: all of them together tell as much as one
 # Of the way since the last fix where a frame was looked for and not found: an odometry that is right would have been
 MISSED_REL = 0.1
 
@@ -189,7 +190,8 @@ class Localiser:
     def _correct(self, fix: Fix) -> None:
         assert self._T_map_ego is not None
         error = self._T_map_ego.between(fix.T_map_ego).log()
-        gain = self._cov @ np.linalg.inv(self._cov + fix.cov)
+        fixes = max(SAME_POINTS_M / max(self.since_fix_m, LEAST_STEP_M), 1.0)
+        gain = self._cov @ np.linalg.inv(self._cov + fixes * fix.cov)
         self._T_map_ego = self._T_map_ego @ SE2.exp(gain @ error)
         self._cov = (np.eye(3) - gain) @ self._cov
         self._cov = 0.5 * (self._cov + self._cov.T)

@@ -1,8 +1,8 @@
 """A map as bytes: a mark, the version, the length and the CRC-32 of what follows, and MessagePack.
 
 Points and lines are rounded to a centimetre and depths' sigmas to 4 %; descriptors are as they are. No images. A file
-of version 2 has no lines and is read; one of another version is refused, not guessed at. Whatever the bytes,
-`decode_map` gives a whole map or raises MapError.
+of version 2 has no lines, one of 3 no scales: both are read; one of another version is refused, not guessed at.
+Whatever the bytes, `decode_map` gives a whole map or raises MapError.
 """
 
 from __future__ import annotations
@@ -22,13 +22,14 @@ from birdslam.loops.keyframe import Fixed, Keyframe, LinePiece, Link
 from birdslam.loops.place_map import MapCamera, PlaceMap
 from birdslam.types import Attitude, Cov3, LineColour, LineKind
 
-VERSION = 3
-READ = 2, 3  # 2 had no lines
+VERSION = 4
+READ = 2, 3, 4  # 2 had no lines, 3 no scales
 MAGIC = b"BirdSLAM map\n"
 HEAD = struct.Struct("<HQI")  # version, bytes, CRC-32
 MOST_BYTES = 1 << 31  # 1,000 km
 MOST_KEYFRAMES, MOST_KEYFRAME_POINTS = 1_000_000, 2048
 MOST_PIECES, MOST_NODES = 64, 64  # of a keyframe's lines, and of each
+LEAST_SCALE, MOST_SCALE_REL = 0.1, 10.0
 POINT_M = 0.01  # what a point's coordinate is rounded to, in 16 bits
 SIGMA_STEP = 0.04  # of the logarithm of a sigma, from LEAST_SIGMA on, in 8 bits
 LEAST_SIGMA = 1e-4
@@ -65,6 +66,7 @@ class KeyframeRecord(msgspec.Struct, frozen=True, array_like=True, forbid_unknow
     points: bytes
     gnss: tuple[float, float, float, float] | None = None  # latitude_deg, longitude_deg, sigma_m, weighed_m
     lines: tuple[PieceRecord, ...] = ()  # since version 3
+    scale: float = 1.0  # since version 4
 
 
 class LinkRecord(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
@@ -75,6 +77,7 @@ class LinkRecord(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fi
     T_from_to: SE2
     cov: Cov3
     loop: bool
+    scale_rel: float = 0.0  # since version 4
 
 
 class EarthRecord(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
@@ -113,7 +116,7 @@ def encode_map(place_map: PlaceMap) -> bytes:
         words,
         [_keyframe_record(keyframe) for keyframe in place_map.keyframes],
         [
-            LinkRecord(link.from_number, link.to_number, link.T_from_to, _cov(link.cov), link.loop)
+            LinkRecord(link.from_number, link.to_number, link.T_from_to, _cov(link.cov), link.loop, link.scale_rel)
             for link in place_map.links
         ],
         None if place_map.earth is None else _earth_record(place_map.earth),
@@ -167,8 +170,10 @@ def _map_of(record: MapRecord) -> PlaceMap:
     for link in record.links:
         if link.from_number not in numbers or link.to_number not in numbers:
             raise MapError("links keyframes that it does not have")
+        if not 0.0 <= link.scale_rel <= MOST_SCALE_REL:
+            raise MapError("has a link whose scale is none")
         cov = _matrix(link.cov)
-        links.append(Link(link.from_number, link.to_number, link.T_from_to, cov, link.loop))
+        links.append(Link(link.from_number, link.to_number, link.T_from_to, cov, link.loop, link.scale_rel))
     words = np.frombuffer(record.words, np.uint8).reshape(-1, DESCRIPTOR_BYTES) if record.words else None
     earth = None if record.earth is None else _earth(record.earth)
     return PlaceMap(camera, keyframes, links, words, record.drives, earth)
@@ -210,6 +215,7 @@ def _keyframe_record(keyframe: Keyframe) -> KeyframeRecord:
         points.tobytes() + sigmas.tobytes() + keyframe.descriptors.tobytes(),
         None if fixed is None else (fixed.latitude_deg, fixed.longitude_deg, fixed.sigma_m, fixed.weighed_m),
         tuple(_piece_record(piece) for piece in keyframe.lines),
+        keyframe.scale,
     )
 
 
@@ -234,6 +240,8 @@ def _keyframe(record: KeyframeRecord) -> Keyframe:
         raise MapError(f"keyframe {record.number}: its attitude is none")
     if not 0.1 < record.camera_height_m < 10.0:
         raise MapError(f"keyframe {record.number}: its camera's height is none")
+    if not LEAST_SCALE < record.scale < 1.0 / LEAST_SCALE:
+        raise MapError(f"keyframe {record.number}: its scale is none")
     if len(record.lines) > MOST_PIECES:
         raise MapError(f"keyframe {record.number}: has {len(record.lines)} lines: more than {MOST_PIECES}")
     fixed = None if record.gnss is None else Fixed(*record.gnss)
@@ -257,6 +265,7 @@ def _keyframe(record: KeyframeRecord) -> Keyframe:
         record.camera_height_m,
         fixed,
         tuple(_piece(each) for each in record.lines),
+        record.scale,
     )
 
 

@@ -44,15 +44,14 @@ def merged(first: PlaceMap, second: PlaceMap) -> tuple[PlaceMap, int]:
         _renumbered(keyframe, number[keyframe.number], first.drives, T_first_second) for keyframe in second.keyframes
     ]
     links = [
-        Link(number[link.from_number], number[link.to_number], link.T_from_to, link.cov, link.loop)
-        for link in second.links
+        replace(link, from_number=number[link.from_number], to_number=number[link.to_number]) for link in second.links
     ]
     loops = [
-        Link(fix.keyframe.number, number[own.number], fix.T_keyframe_ego, fix.cov + shared(fix), loop=True)
+        Link(fix.keyframe.number, number[own.number], fix.in_odometry, fix.cov + shared(fix), loop=True)
         for own, fix in agreeing
     ]
     keyframes, every = [*first.keyframes, *moved], [*first.links, *links, *loops]
-    poses = close_loops(keyframes, every)
+    poses = close_loops(keyframes, every, agreed=True)
     out = PlaceMap(first.camera, keyframes, held(every, poses), None, first.drives + second.drives, first.earth)
     out.place(poses)
     out.learn()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import msgspec
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from birdslam.geometry.arrays import Bools, Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
+from birdslam.loops.closing import Solved
 from birdslam.loops.gnss.earth import Earth
 from birdslam.loops.gnss.factors import OnEarth
 from birdslam.loops.keyframe import Fixed, Keyframe, LinePiece, Link
@@ -114,8 +115,8 @@ class PlaceMap:
         elif self._index is not None:
             self._index.add(keyframe.descriptors)
 
-    def place(self, poses: dict[int, tuple[SE2, Floats]]) -> None:
-        """Moves keyframes, by number, to other poses with their covariances."""
+    def place(self, poses: Mapping[int, Solved]) -> None:
+        """Moves keyframes, by number, to where the graph has them."""
         self.keyframes = [
             keyframe.at(*poses[keyframe.number]) if keyframe.number in poses else keyframe
             for keyframe in self.keyframes

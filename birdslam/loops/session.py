@@ -16,7 +16,7 @@ from birdslam.geometry.arrays import Bools, Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.closing import close_loops, held
-from birdslam.loops.drift import moved
+from birdslam.loops.drift import link_cov, moved, own_scale_rel
 from birdslam.loops.features import FeatureExtractor
 from birdslam.loops.keyframe import Keyframe, Link
 from birdslam.loops.keyframe_builder import LOOK_M, LOOK_NS, KeyframeBuilder, Look, NewKeyframe
@@ -54,7 +54,9 @@ class MapSession:
         self._travelled_m = 0.0
         self._looked_m, self._looked_ns = -math.inf, -(1 << 62)
         self._own: list[tuple[int, float]] = []  # rows of this drive's keyframes, and the way at each
-        self._chain: tuple[int, SE2] | None = None  # the last keyframe's number and its T_odom_keyframe
+        self._chain: tuple[int, SE2, float] | None = (
+            None  # the last keyframe's number, its T_odom_keyframe, Look.unsure_m2
+        )
         self._linked_m, self._joint_m = -math.inf, -math.inf
         self._fixes: list[tuple[float, SE2, int, SE2, Floats]] = []
         self._open_loops, self._closed_m = 0, -math.inf  # loops since the last optimisation, and the way there
@@ -158,7 +160,7 @@ class MapSession:
         self.localiser.map_epoch = pose.map_epoch
         if len(self.map):
             last = self.map.keyframes[-1]
-            self._chain = last.number, pose.T_map_odom.inverse() @ last.T_map_keyframe
+            self._chain = last.number, pose.T_map_odom.inverse() @ last.T_map_keyframe, 0.0
 
     def _look(self, estimate: Estimate, image: NDArray[np.uint8]) -> None:
         self._looked_m, self._looked_ns = self._travelled_m, estimate.t_source_ns
@@ -170,6 +172,8 @@ class MapSession:
             estimate.T_world_ego,
             estimate.attitude,
             features,
+            own_scale_rel(estimate.scale_sigma_rel, self._camera.scale_sigma_rel),
+            self.localiser.steps.sum_m2,
         )
         was_lost = self.localiser.state is MapState.LOST
         if self.localiser.look(features, self._among()):
@@ -197,7 +201,7 @@ class MapSession:
         if fix is not None and self._travelled_m - self._linked_m >= LOOP_EVERY_M:
             self._linked_m = self._travelled_m
             cov = fix.cov + shared(fix)
-            self._fixes.append((look.travelled_m, look.T_odom_ego, fix.keyframe.number, fix.T_keyframe_ego, cov))
+            self._fixes.append((look.travelled_m, look.T_odom_ego, fix.keyframe.number, fix.in_odometry, cov))
 
     def _take(self, made: list[NewKeyframe]) -> None:
         for new in made:
@@ -235,11 +239,13 @@ class MapSession:
         self._own.append((len(self.map) - 1, new.look.travelled_m))
         self.localiser.own_way_m[len(self.map) - 1] = new.look.travelled_m
         if self._chain is not None:
-            last, T_odom_last = self._chain
+            (last, T_odom_last, unsure_m2), scale_rel = self._chain, new.look.scale_rel
             step = T_odom_last.between(new.look.T_odom_ego)
-            self.map.links.append(Link(last, number, step, moved(np.zeros((3, 3)), step)))
+            self.map.links.append(
+                Link(last, number, step, link_cov(step, scale_rel, new.look.unsure_m2 - unsure_m2), scale_rel=scale_rel)
+            )
         self._close(new, number)
-        self._chain = number, new.look.T_odom_ego
+        self._chain = number, new.look.T_odom_ego, new.look.unsure_m2
 
     def _give_lines(self, row: int, new: NewKeyframe, T_map_keyframe: SE2) -> None:
         """To the map's keyframe in this place, if it has none."""

@@ -57,9 +57,9 @@ class LocalMap:
         back = inverse(keyframe.T_map)
         for other in (keyframe, *neighbours):
             T = back @ other.T_map
-            points.append(other.points_m @ T[:3, :3].T + T[:3, 3])
-            from_camera = other.points_m - np.array([0.0, 0.0, other.camera_height_m])
-            along.append((from_camera * other.sigma_depth_rel[:, None]) @ T[:3, :3].T)
+            from_camera = other.from_camera_m @ T[:3, :3].T
+            points.append(from_camera + T[:3, 3] + other.camera_height_m * T[:3, 2])
+            along.append(from_camera * other.sigma_depth_rel[:, None])
             descriptors.append(other.descriptors)
         return LocalMap(keyframe, np.concatenate(points), np.concatenate(along), np.concatenate(descriptors))
 
@@ -79,6 +79,11 @@ class Fix:
     @property
     def T_map_ego(self) -> SE2:
         return self.keyframe.T_map_keyframe @ self.T_keyframe_ego
+
+    @property
+    def in_odometry(self) -> SE2:
+        """T_keyframe_ego in metres of the odometry that made the keyframe."""
+        return self.T_keyframe_ego.scaled(1.0 / self.keyframe.scale)
 
     def attitude_in_map(self, camera: Camera) -> Attitude:
         """Of the ego, with the keyframe's own."""

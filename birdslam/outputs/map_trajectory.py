@@ -12,9 +12,11 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
+from birdslam.geometry.se2 import SE2
 from birdslam.loops.drift import is_exact, moved
 from birdslam.loops.localiser import Localisation
 from birdslam.loops.map_pose import MapState
@@ -27,6 +29,15 @@ MOST_WAITING = 3000  # frames of an ego that stands somewhere unknown
 HEADER = "t_s,state,x_m,y_m,yaw_rad,cov_xx,cov_xy,cov_xyaw,cov_yy,cov_yyaw,cov_yawyaw,inliers,map_epoch"
 
 
+class _Moment(NamedTuple):
+    """What of an estimate a row that waits is led back by: of whole ones, thousands would wait."""
+
+    epoch: int
+    T_world_ego: SE2
+    valid: bool
+    scale_sigma_rel: float
+
+
 class MapTrajectory:
     """`add` takes every frame in order and gives those that are settled; `finish` gives the rest.
 
@@ -34,23 +45,24 @@ class MapTrajectory:
     """
 
     def __init__(self) -> None:
-        self._waiting: deque[tuple[Localisation, Estimate]] = deque()
+        self._waiting: deque[tuple[Localisation, _Moment]] = deque()
         self.counts = {state.value: 0 for state in MapState}  # settled frames by their state
         self.first_ns: int | None = None  # source time of the first frame that was localised while driving
         self.frames_before = 0  # that came before it
 
     def add(self, localisation: Localisation, estimate: Estimate) -> list[Localisation]:
         """One frame."""
+        moment = _Moment(estimate.epoch, estimate.T_world_ego, estimate.valid, estimate.scale_sigma_rel)
         localised = localisation.state is MapState.LOCALISED
         if localised and self.first_ns is None:
             self.first_ns = localisation.t_source_ns
         self.frames_before += self.first_ns is None
-        self._waiting.append((localisation, estimate))
+        self._waiting.append((localisation, moment))
         if localised:
             self._lead_back()
             return self.finish()
         out = []
-        while len(self._waiting) > MOST_WAITING or self._too_far(estimate):
+        while len(self._waiting) > MOST_WAITING or self._too_far(moment):
             out.append(self._waiting.popleft()[0])
         return self._settled(out)
 
@@ -60,10 +72,10 @@ class MapTrajectory:
         self._waiting.clear()
         return self._settled(out)
 
-    def _too_far(self, estimate: Estimate) -> bool:
+    def _too_far(self, newest: _Moment) -> bool:
         _, first = self._waiting[0]
-        step = first.T_world_ego.between(estimate.T_world_ego)
-        return first.epoch != estimate.epoch or math.hypot(step.x_m, step.y_m) > MOST_BACK_M
+        step = first.T_world_ego.between(newest.T_world_ego)
+        return first.epoch != newest.epoch or math.hypot(step.x_m, step.y_m) > MOST_BACK_M
 
     def _settled(self, rows: list[Localisation]) -> list[Localisation]:
         for row in rows:
@@ -75,18 +87,18 @@ class MapTrajectory:
         assert found.T_map_ego is not None
         cov, way_m, later = found.cov, 0.0, newest
         for place in range(len(self._waiting) - 2, -1, -1):
-            lost, estimate = self._waiting[place]
-            step = later.T_world_ego.between(estimate.T_world_ego)
+            lost, moment = self._waiting[place]
+            step = later.T_world_ego.between(moment.T_world_ego)
             way_m += math.hypot(step.x_m, step.y_m)
             cov = moved(cov, step, later.valid, later.scale_sigma_rel)
-            if estimate.epoch != newest.epoch or way_m > MOST_BACK_M or not is_exact(cov):
+            if moment.epoch != newest.epoch or way_m > MOST_BACK_M or not is_exact(cov):
                 return
-            T_map_ego = found.T_map_ego @ newest.T_world_ego.between(estimate.T_world_ego)
+            T_map_ego = found.T_map_ego @ newest.T_world_ego.between(moment.T_world_ego)
             led = Localisation(
                 *(lost.frame_id, lost.t_source_ns, MapState.LOCALISED, T_map_ego, cov, found.attitude),
                 map_epoch=found.map_epoch,
             )
-            self._waiting[place], later = (led, estimate), estimate
+            self._waiting[place], later = (led, moment), moment
 
 
 class TrajectoryFiles(contextlib.AbstractContextManager["TrajectoryFiles"]):

@@ -57,12 +57,12 @@ def write_places(directory: Path, places: Sequence[Place]) -> None:
 def write_around(directory: Path) -> list[str]:
     """What was seen from the places of a drive's folder; gives the files. Raises OSError."""
     try:
-        table = np.genfromtxt(directory / PLACES_FILE, delimiter=",", skip_header=1, ndmin=2)
+        rows = (directory / PLACES_FILE).read_text(encoding="utf-8").splitlines()[1:]
     except FileNotFoundError:
         return []
-    if not table.size:
+    if not rows:  # the drive was never localised
         return []
-    places = _Places(table)
+    places = _Places(np.genfromtxt(rows, delimiter=",", ndmin=2))
     lines = list(_lines(directory / "map.geojson"))
     features = [
         {

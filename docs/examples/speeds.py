@@ -1,5 +1,5 @@
 """Distances and speeds of another detector's boxes: python speeds.py VIDEO CAMERA.toml BOXES OUT.mp4 (pip install
-supervision). BOXES is a file of MOT, KITTI or COCO (docs/networks.md); a detector in Python hands over its
+'birdslam[supervision]'). BOXES is a file of MOT, KITTI or COCO (docs/networks.md); a detector in Python hands over its
 `supervision.Detections` in its place."""
 
 import sys

@@ -3,9 +3,9 @@
     python -m perf lens [DRIVE ...] [--output DIR] [--data DIR] [--films DIR] [--render DIR] [--images N] [--networks]
 
 Each drive twice, with a focal length beforehand that is 15 % too long and 15 % too short, known to 15 %. Rows: turn of
-the camera within the windows, errors of focal length and k1 with their own sigma, whether the drive showed the focal
-length, and the way of its first 6 s by the found lens over that by the true one. Rendered dashcams lie in `--films`
-(tests/dashcams); `--render` renders them anew (extra `train`, PyAV). Writes lens.json and lens.md.
+the camera, errors of focal length and k1 with their own sigma, whether the drive showed the focal length, the bend by
+upright lines, and the way of its first 6 s by the found lens over that by the true one. Rendered dashcams lie in
+`--films`; `--render` renders them anew (extra `train`, PyAV). Writes lens.json and lens.md.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from birdslam.calibration.lens import CornersOfImage, followed_corners, self_calibrate
+from birdslam.calibration.uprights import lens_by_uprights, upright_edges
 from birdslam.geometry.camera import Camera, Undistorter
 from birdslam.odometry.odometry import Odometry
 from birdslam.perf.accuracy.drives import is_valid, networks_of
@@ -45,6 +46,7 @@ PRIORS = 1.15, 1.0 / 1.15
 PRIOR_SIGMA = 0.15
 METRES_S = 6.0  # of a drive, whose way is compared
 NO_BOXES = np.zeros((0, 4))
+UPRIGHT_IMAGES = 30  # of a drive, in which upright lines are looked for
 
 
 @dataclass(frozen=True)
@@ -177,12 +179,20 @@ def rows_of(drive: Drive, configuration: Configuration | None) -> Iterator[dict[
     images = [frame.image for frame in recording.frames() if frame.image is not None]
     boxes = _boxes(recording, configuration, images)
     corners = [CornersOfImage(each.ids, each.px) for each in followed_corners(zip(images, boxes, strict=True), camera)]
+    uprights = lens_by_uprights([upright_edges(image) for image in images[:: max(1, len(images) // UPRIGHT_IMAGES)]])
+    bend = None if uprights is None else (uprights.bend, uprights.bend_sigma)
+    by_lines = {
+        "true_bend": true_k1 * (camera.width_px / true_px) ** 2,
+        "bend": None if bend is None else bend[0],
+        "bend_sigma": None if bend is None else bend[1],
+    }
     some = images[: max(2, round(METRES_S * recording.rate_hz))]
     true_way_m, over_truth = way_m(camera, some, recording.rate_hz, drive.T_world_cam)
     for prior in PRIORS:
-        lens = self_calibrate(corners, (camera.width_px, camera.height_px), prior * true_px, PRIOR_SIGMA)
+        lens = self_calibrate(corners, (camera.width_px, camera.height_px), prior * true_px, PRIOR_SIGMA, bend=bend)
+        same = {"prior": prior, "images": len(images), "true_px": true_px, "true_k1": true_k1, **by_lines}
         if lens is None:
-            yield {"prior": prior, "images": len(images), "true_px": true_px, "true_k1": true_k1, "focal_shown": None}
+            yield {**same, "focal_shown": None}
             continue
         found = replace(
             camera,
@@ -195,10 +205,7 @@ def rows_of(drive: Drive, configuration: Configuration | None) -> Iterator[dict[
         )
         found_way_m, _ = way_m(found, some, recording.rate_hz, None)
         yield {
-            "prior": prior,
-            "images": len(images),
-            "true_px": true_px,
-            "true_k1": true_k1,
+            **same,
             "turned_deg": math.degrees(lens.turned_rad),
             "windows": lens.windows,
             "focal_error": math.log(lens.focal_px / true_px),
@@ -250,8 +257,13 @@ def row_text(row: dict[str, Any]) -> str:
     return (
         f"turned {row['turned_deg']:.0f} deg, f {row['focal_error']:+.1%} +- {row['focal_sigma']:.1%} "
         f"{'' if row['focal_shown'] else '(kept) '} k1 {row['k1']:+.3f} +- {row['k1_sigma']:.3f} (true "
-        f"{row['true_k1']:+.3f}), way {way}, by the true lens {_off(row['way_by_true_lens'])} of the truth"
+        f"{row['true_k1']:+.3f}; bend by lines {_bend(row)}, true {row['true_bend']:+.2f}), way {way}, "
+        f"by the true lens {_off(row['way_by_true_lens'])} of the truth"
     )
+
+
+def _bend(row: dict[str, Any]) -> str:
+    return "-" if row["bend"] is None else f"{row['bend']:+.2f} +- {row['bend_sigma']:.2f}"
 
 
 def _off(ratio: float | None) -> str:
@@ -272,18 +284,22 @@ def table(rows: list[dict[str, Any]]) -> str:
         "long (`phone`: 30 ms), and nothing in a film tells how long its camera takes. So a film's stated sigma has",
         "17 ms of it in (runtime/calibration/height.py), the more the faster it drives.",
         "",
-        "| drive | prior | turn, deg | focal length off by | sigma | | k1 | sigma | true k1 | way | true lens |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
+        "*Bend* is k1 over the square of the focal length in image widths: what lines that are upright in the world",
+        "say of it (birdslam/calibration/uprights.py), which the bundle adjustment takes as known beforehand.",
+        "",
+        "| drive | prior | turn, deg | focal length off by | sigma | | bend by lines | true bend | k1 | sigma "
+        "| true k1 | way | true lens |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
         head = f"| {row['drive']} | {row['prior'] - 1.0:+.0%} |"
         if row["focal_shown"] is None:
-            out.append(f"{head} | | | too little to see | | | {row['true_k1']:+.3f} | | |")
+            out.append(f"{head} | | | too little to see | | | | | {row['true_k1']:+.3f} | | |")
             continue
         way = f"{_off(row['way_over_true'])} | {_off(row['way_by_true_lens'])}"
         out.append(
             f"{head} {row['turned_deg']:.0f} | {row['focal_error']:+.1%} | {row['focal_sigma']:.1%} | "
-            f"{'shown' if row['focal_shown'] else 'kept'} | {row['k1']:+.3f} | {row['k1_sigma']:.3f} | "
-            f"{row['true_k1']:+.3f} | {way} |"
+            f"{'shown' if row['focal_shown'] else 'kept'} | {_bend(row)} | {row['true_bend']:+.2f} | "
+            f"{row['k1']:+.3f} | {row['k1_sigma']:.3f} | {row['true_k1']:+.3f} | {way} |"
         )
     return "\n".join(out) + "\n"

@@ -3,8 +3,9 @@
     python -m perf edges --logs DIR [--model ROLE=PATH ...] [--clips 0005,0002] [--seeds 3] [--output FILE]
 
 Logs of images are recorded once by the whole front end and kept in DIR; simulated ones are made anew. ATE in m, nothing
-aligned; NEES over its degrees of freedom, the ego's in the world, a vehicle's in the ego's frame. Vehicles are those
-labelled in five frames or more; 00 and 06 begin where their true poses are no longer interpolated.
+aligned; NEES over its degrees of freedom, the ego's in the world, also beside the error of the true poses' axes, a
+vehicle's in the ego's frame. Vehicles are those labelled in five frames or more; 00 and 06 begin where their true poses
+are no longer interpolated.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.bench.baselines.trajectories import LiveTrajectories, Trajectories
+from birdslam.bench.ego.motion_consistency import moved_by_turn
+from birdslam.bench.ego.truth_quality import AXES_SIGMA_RAD
 from birdslam.bench.figures import markdown
 from birdslam.bench.simulation.edge_statistics import EdgeStatistics, edge_statistics
 from birdslam.bench.simulation.odometry import SimulatedOdometry, SimulationConfig
@@ -135,12 +138,16 @@ def _reweighed(field: str, factor: float) -> Change:
 
 @dataclass(frozen=True)
 class Case:
-    """A log with the ego's true poses in the world of its first frame and, of tracking sequences, labels."""
+    """A log with the ego's true poses in the world of its first frame and, of tracking sequences, labels.
+
+    `axes_rad` is 1-sigma of the angle between the true poses' axes and their way.
+    """
 
     name: str
     log: list[Measurements]
     ego: dict[int, SE2]
     truth: Truth | None
+    axes_rad: float = 0.0
 
 
 def recorded(name: str, data: Path, logs: Path, configuration: Configuration) -> Case:
@@ -159,7 +166,7 @@ def recorded(name: str, data: Path, logs: Path, configuration: Configuration) ->
     log = msgspec.msgpack.decode(path.read_bytes(), type=list[Measurements])[left_out:]
     if folder.startswith(TRACKING):
         truth = Truth.of(open_tracking(data / TRACKING, name), log)
-        return Case(name, log, truth.ego, truth)
+        return Case(name, log, truth.ego, truth, AXES_SIGMA_RAD)
     recording = open_recording(f"kitti:{data / folder}")
     poses = recording.truth_poses()
     assert poses is not None, name
@@ -167,7 +174,7 @@ def recorded(name: str, data: Path, logs: Path, configuration: Configuration) ->
     camera = inverse(T_cam0_cam) @ as_poses(poses) @ T_cam0_cam
     first = inverse(camera[log[0].frame_id])
     ego = {m.frame_id: split_pose(mount @ first @ camera[m.frame_id] @ inverse(mount))[0] for m in log}
-    return Case(name, log, ego, None)
+    return Case(name, log, ego, None, AXES_SIGMA_RAD)
 
 
 def _plain(value: object) -> object:
@@ -200,7 +207,7 @@ def grade(variant: Variant, case: Case) -> dict[str, float]:
     """ATE of ego and cars (mean, live and final; each car's as "live 31") and NEES of both."""
     graph, live = PoseGraph(variant.live.graph, variant.live.weights), LiveTrajectories()
     smoother = RtsSmoother(SmootherConfig())
-    of_ego, of_cars = [], []
+    of_ego, of_ego_beside_axes, of_cars = [], [], []
     for record in case.log:
         m = variant.change(record)
         estimate = graph.optimise(m)
@@ -208,12 +215,17 @@ def grade(variant: Variant, case: Case) -> dict[str, float]:
         smoother.add(m, estimate)
         error = estimate.T_world_ego.between(case.ego[m.frame_id]).log()
         if estimate.epoch == 0 and m is not case.log[0]:
-            of_ego.append(_nees(np.asarray(error), np.reshape(estimate.cov, (3, 3))))
+            cov = np.reshape(estimate.cov, (3, 3))
+            of_ego.append(_nees(np.asarray(error), cov))
+            aside = case.axes_rad * moved_by_turn(estimate.T_world_ego)
+            of_ego_beside_axes.append(_nees(np.asarray(error), cov + np.outer(aside, aside)))
         if case.truth is not None:
             of_cars += _nees_of_cars(graph, m, case.truth)
     ego = path_errors(case.ego, live.result.ego)
     assert ego is not None
     out = {"ego": ego.ate_m, "NEES of the ego": float(np.mean(of_ego)) / EGO_DIMENSIONS}
+    if case.axes_rad:
+        out["beside the truth's axes"] = float(np.mean(of_ego_beside_axes)) / EGO_DIMENSIONS
     if case.truth is None:
         return out
     final = Trajectories(ego=live.result.ego)

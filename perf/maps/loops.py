@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,20 +31,16 @@ from birdslam.loops.place_map import MapCamera, PlaceMap
 from birdslam.loops.session import MapSession
 from birdslam.outputs.map_trajectory import MapTrajectory
 from birdslam.perf.maps import scale_drift, simulated, town
+from birdslam.perf.maps.estimates import Seen, estimated
 from birdslam.perf.reporting.arguments import add_data, benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
-from birdslam.runtime.batch.offline import pipeline
-from birdslam.runtime.configuration import load
 from birdslam.runtime.nodes.sources import open_recorded
-from birdslam.types import Estimate
 
 label = "places found again, poses in a kept map, loops closed; a map's size and look-up time"
 
 PARTS = "recorded", "town", "loop", "alike", "scale", "gnss", "size"
 BASE_M = 0.537  # between the cameras of the two passes
 OTHERS = ("kitti_odometry/sequences/00", "kitti_odometry/sequences/06", "kitti_tracking/training/image_03/0005")
-
-Seen = tuple[Estimate, NDArray[np.uint8]]
 
 
 def run(arguments: list[str]) -> None:
@@ -61,7 +57,7 @@ def run(arguments: list[str]) -> None:
         if "recorded" in options.part:
             recorded(ledger, options.data, [FeatureKind(kind) for kind in options.features])
         if "town" in options.part:
-            town.measure(ledger, options.drives, estimated)
+            town.measure(ledger, options.drives)
         if "loop" in options.part:
             simulated.loop(ledger, options.way)
         if "alike" in options.part:
@@ -72,18 +68,6 @@ def run(arguments: list[str]) -> None:
             simulated.gnss(ledger, options.way)
         if "size" in options.part:
             simulated.size(ledger)
-
-
-def estimated(uri: str) -> Iterator[Seen]:
-    """A recording's frames, undistorted, with their estimates by the whole pipeline."""
-    recording = open_recorded(uri)
-    frames = recording.undistorted_frames()
-    with pipeline(load(None, {"source.uri": uri})) as through:
-        for record in through(recording):
-            if isinstance(record, Estimate):
-                frame = next(each for each in frames if each.frame_id == record.frame_id)
-                if frame.image is not None:
-                    yield record, frame.image
 
 
 def recorded(ledger: Ledger, data: Path, kinds: Sequence[FeatureKind]) -> None:

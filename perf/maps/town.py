@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import importlib.util
 import itertools
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
@@ -21,12 +20,12 @@ from birdslam.loops.map_pose import MapState
 from birdslam.loops.place_map import MapCamera, PlaceMap
 from birdslam.loops.session import MapSession
 from birdslam.perf.errors import PerfError
+from birdslam.perf.maps.estimates import Seen, estimated_once
 from birdslam.perf.reporting.figures import Ledger
 from birdslam.runtime.progress import with_progress
 from birdslam.runtime.world.demo_drive import write
 from birdslam.sources.shipped_drive import DemoRecording
 from birdslam.trajectory import inverse, mount_pose, split_pose
-from birdslam.types import Estimate
 
 QUALITY = 90  # of the WebP images
 TWICE = "twice"
@@ -34,9 +33,6 @@ BEGIN = "begin.npy"  # beside a drive: T_world_cam of its first image, which mak
 FALSE_M = 2.0  # a loop, or a pose in the map, that is off by more is another place
 KIDNAPPED = ("traffic", "lane", 150)  # from this image of one drive to the first of the other
 RECOVERY_M = 50.0
-
-Seen = tuple[Estimate, NDArray[np.uint8]]
-Estimated = Callable[[str], Iterator[Seen]]
 
 
 @dataclass(frozen=True)
@@ -56,16 +52,16 @@ class _Drive:
         return _Drive(recording, [split_pose(T_world_cam0 @ T @ inverse(mount))[0] for T in poses])
 
 
-def measure(ledger: Ledger, drives: Path, estimated: Estimated) -> None:
+def measure(ledger: Ledger, drives: Path) -> None:
     """All drives of the town, each rendered where it is not there. Raises PerfError."""
     names = render(drives)
-    place_map, T_world_map = _twice(ledger, drives / TWICE, estimated)
+    place_map, T_world_map = _twice(ledger, drives / TWICE)
     kept = encode_map(place_map)
-    before = {name: list(estimated(f"demo:{drives / name}")) for name in KIDNAPPED[:2]}
+    before = {name: list(estimated_once(drives / name)) for name in KIDNAPPED[:2]}
     for name, differs in names.items():
         if name != TWICE:
             drive = _Drive.open(drives / name)
-            frames = before.get(name) or estimated(f"demo:{drives / name}")
+            frames = before.get(name) or estimated_once(drives / name)
             found = _localise(kept, drive, frames)
             row = _judged(found, drive.truth, place_map, T_world_map)
             ledger.add(f"town: {differs}", row["text"], **row)
@@ -93,7 +89,7 @@ def render(folder: Path) -> dict[str, str]:
     return out
 
 
-def _twice(ledger: Ledger, folder: Path, estimated: Estimated) -> tuple[PlaceMap, dict[int, SE2]]:
+def _twice(ledger: Ledger, folder: Path) -> tuple[PlaceMap, dict[int, SE2]]:
     """Two rounds: what closing them brings; the map, and the true place of each of its keyframes by number."""
     drive = _Drive.open(folder)
     place_map = PlaceMap(MapCamera.of(drive.recording.camera))
@@ -103,7 +99,7 @@ def _twice(ledger: Ledger, folder: Path, estimated: Estimated) -> tuple[PlaceMap
     T_map_world: SE2 | None = None
     last: Localisation | None = None
     localised = frames = 0
-    for estimate, image in estimated(f"demo:{folder}"):
+    for estimate, image in estimated_once(folder):
         last = session.step(estimate, image)
         if T_map_world is None and estimate.valid:
             T_map_world = estimate.T_world_ego @ drive.truth[estimate.frame_id].inverse()

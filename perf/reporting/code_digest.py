@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from birdslam.perf.errors import PerfError
+from birdslam.perf.reporting.machine import ROOT
 
 DIGITS = 10  # of a digest, as it is shown and kept
 WHOLE_BELOW = 64 << 10  # bytes: of larger files of data name and size are digested
@@ -110,6 +111,12 @@ class Code:
         if name not in self._modules:
             self._modules[name] = _read(name, ast.parse(self._files[name].read_text(encoding="utf-8")), self._files)
         return self._modules[name]
+
+
+def checkout() -> Code:
+    """The code as it lies here."""
+    folders = {"birdslam": "birdslam", "birdslam.runtime": "runtime", "birdslam.perf": "perf", "tests": "tests"}
+    return Code({name: ROOT / folder for name, folder in folders.items()})
 
 
 def _read(name: str, tree: ast.Module, known: Mapping[str, Path]) -> Module:

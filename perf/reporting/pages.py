@@ -32,7 +32,7 @@ from birdslam.perf.perception import providers
 from birdslam.perf.reporting import all as everything
 from birdslam.perf.reporting import foxglove, leave_one_out, measured, results
 from birdslam.perf.reporting.arguments import benchmark_parser
-from birdslam.perf.reporting.code_digest import Code, files_digest
+from birdslam.perf.reporting.code_digest import Code, checkout, files_digest
 from birdslam.perf.reporting.machine import ROOT, describe
 from birdslam.perf.reporting.measured import Measured
 from birdslam.perf.robustness import faults
@@ -281,12 +281,6 @@ def _takes_s(page: Derived | Page, kept: Mapping[str, Measured]) -> float:
         return 0.0
     last = kept[page.name].takes_s if page.name in kept else None
     return float("inf") if last is None else last
-
-
-def checkout() -> Code:
-    """The code as it lies here."""
-    folders = {"birdslam": "birdslam", "birdslam.runtime": "runtime", "birdslam.perf": "perf", "tests": "tests"}
-    return Code({name: ROOT / folder for name, folder in folders.items()})
 
 
 def digests(page: Page, code: Code) -> tuple[str, str | None]:

@@ -3,8 +3,9 @@
     python -m perf soak [--minutes 30] [--rate 33] [--source demo] [--map] [--record] [--models DIR] [...]
 
 Further options are those of `birdslam run`; without `--source` the software camera of the fault suite drives down its
-street. Ends with status 1, and says why, where after the first minute a process grew by more than 1 % or held more
-descriptors, was restarted or missed a watchdog (the soak stands in systemd's place), or estimates came later.
+street. Ends with status 1, and says why, where after the first minute a process grew by more than 1 %, or would in
+eight hours by what its second half gained (beyond 3 sigma), held more descriptors, was restarted or missed a watchdog
+(the soak stands in systemd's place), or estimates came later.
 """
 
 from __future__ import annotations
@@ -41,6 +42,8 @@ MAP_FILE = "soak.map"
 WARM_S, SAMPLE_S, SAID_S = 60.0, 5.0, 30.0
 SPAN = 6  # samples at either end whose medians are compared: what a process holds swings by its garbage
 GROWTH = 0.01
+SHIFT_H = 8.0  # of driving, to which the second half is carried on: by then what a start makes once is made
+SIGMAS = 3.0  # of that growth, before it counts as one: eight processes, each a chance
 AGE_GROWTH = 0.1  # of the age's median, first quarter to last
 WATCHDOG_S = 5.0  # of the supervisor, as in deploy/birdslam.service
 
@@ -99,6 +102,12 @@ class Series:
         before, after = self.ends()
         return after / before - 1.0
 
+    def in_a_shift(self) -> tuple[float, float]:
+        """By what share it would grow in SHIFT_H as in its second half, and the sigma; NaN: too short to tell."""
+        half = len(self.mib) // 2
+        gain, sigma = slope(self.t_s[half:], self.mib[half:])
+        return gain * SHIFT_H / self.mib[0], sigma * SHIFT_H / self.mib[0]
+
     @property
     def leaked(self) -> int:
         """Descriptors that it holds at the end and did not at the beginning."""
@@ -148,6 +157,9 @@ def faults(series: Mapping[str, Series], summary: dict[str, Any], systemd: Syste
     for name, one in series.items():
         if one.growth > GROWTH:
             yield f"{name} grew by {one.growth:.1%}"
+        gain, sigma = one.in_a_shift()
+        if gain - SIGMAS * sigma > GROWTH:
+            yield f"{name} would grow by {gain:.1%} +- {sigma:.1%} in {SHIFT_H:g} hours"
         if one.leaked > 0:
             yield f"{name} holds {one.leaked} descriptors more"
         if len(one.pids) > 1:
@@ -194,8 +206,8 @@ def table(series: Mapping[str, Series], summary: dict[str, Any], systemd: System
     begun_anew = restarts(summary) | {"supervisor": systemd.missed}
     dropped = summary["dropped_by"] | {"record": summary.get("recording", {}).get("dropped", 0)}
     columns = (
-        *("MiB at 1 min", "MiB at end", "growth", "MiB an hour", "descriptors", "descriptors an hour"),
-        *("watchdogs missed", "drops"),
+        *("MiB at 1 min", "MiB at end", "growth", "MiB an hour", f"in {SHIFT_H:g} h by the second half"),
+        *("descriptors", "descriptors an hour", "watchdogs missed", "drops"),
     )
     lines = ["| process | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
     for name, one in series.items():
@@ -203,6 +215,7 @@ def table(series: Mapping[str, Series], summary: dict[str, Any], systemd: System
         mib, descriptors = slope(one.t_s, one.mib), slope(one.t_s, one.descriptors)
         cells = (
             *(f"{before:.1f}", f"{after:.1f}", f"{one.growth:+.2%}", "{:+.2f} +- {:.2f}".format(*mib)),
+            "{:+.1%} +- {:.1%}".format(*one.in_a_shift()),
             *(f"{one.descriptors[0]} -> {one.descriptors[-1]}", "{:+.2f} +- {:.2f}".format(*descriptors)),
             *(str(begun_anew.get(name, "")), str(dropped.get(name, ""))),
         )

@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from birdslam.calibration.calibration import CalibrationError
 from birdslam.calibration.intrinsics import Intrinsics
-from birdslam.calibration.lens import followed_corners, self_calibrate
+from birdslam.calibration.lens import WIDE_SIGMA_REL, followed_corners, k1_by_bend, self_calibrate
 from birdslam.calibration.lens_adjustment import IMAGES
+from birdslam.calibration.uprights import LensByUprights, lens_by_uprights, upright_edges
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
-from birdslam.runtime.calibration.given import Given, focal_length_of
+from birdslam.runtime.calibration.given import FocalLength, Given, focal_length_of
 from birdslam.runtime.calibration.height import UNKNOWN_HEIGHT_M
 from birdslam.runtime.configuration import Configuration, complete
 from birdslam.runtime.nodes.inference import Inference
@@ -22,6 +23,7 @@ from birdslam.runtime.nodes.sources import RecordedSource, offline_frames, open_
 from birdslam.runtime.progress import with_progress
 
 _LENS_S = 120.0  # of a film, from which its lens is found
+_UPRIGHT_IMAGES = 30  # of these, in which upright lines are looked for
 
 
 def lens_of_drive(
@@ -33,35 +35,47 @@ def lens_of_drive(
     """
     width_px, height_px = size_px
     known = focal_length_of(given, uri, width_px)
-    focal_px, sigma_rel, by = known.px, known.sigma_rel, known.by
+    focal_px = known.px
     middle = 0.5 * (width_px - 1.0), 0.5 * (height_px - 1.0)
     camera = Camera(width_px, height_px, focal_px, focal_px, *middle, height_m=given.height_m or UNKNOWN_HEIGHT_M)
     recording = open_recorded(uri, camera, stride, configuration.source.topics)
     configuration = configuration.as_lossless()
     frames = max(1, round(_LENS_S * recording.rate_hz))
+    every = max(1, min(frames, len(recording) or frames) // _UPRIGHT_IMAGES)
+    edges: list[Floats] = []
     with Inference(complete(configuration, camera, recording.rate_hz)) as inference:
 
         def images() -> Iterator[tuple[NDArray[np.uint8], Floats]]:
             seen = islice(offline_frames(RecordedSource(recording, configuration.source)), frames)
-            for frame in with_progress(seen, "lens", min(frames, len(recording)) or None):
+            for index, frame in enumerate(with_progress(seen, "lens", min(frames, len(recording)) or None)):
                 if frame.image is not None:
+                    if index % every == 0:
+                        edges.append(upright_edges(frame.image))
                     found = inference.start(frame).result().detections
                     yield frame.image, np.zeros((0, 4)) if found is None else found.boxes_px
 
         corners = followed_corners(images(), camera)
-    lens = self_calibrate(corners, size_px, focal_px, sigma_rel, known.by_view, known.fisheye)
+    uprights = lens_by_uprights(edges)
+    known = with_uprights(known, uprights, width_px)
+    focal_px, sigma_rel, by = known.px, known.sigma_rel, known.by
+    bend = None if uprights is None or known.fisheye else (uprights.bend, uprights.bend_sigma)
+    lens = self_calibrate(corners, size_px, focal_px, sigma_rel, known.by_view, known.fisheye, bend)
     if lens is None and not must_show and len(corners) >= IMAGES:
+        k1 = 0.0 if bend is None else k1_by_bend(bend, focal_px / width_px)[0]
+        shape = (
+            "equidistant" if known.fisheye else "no distortion" if bend is None else f"k1 {k1:+.3f} by upright lines"
+        )
         return Intrinsics(
             fx_px=focal_px,
             fy_px=focal_px,
             cx_px=middle[0],
             cy_px=middle[1],
-            distortion=(0.0,) * 4 if known.fisheye else (),
+            distortion=(k1, 0.0, 0.0, 0.0) if known.fisheye or bend is not None else (),
             fisheye=known.fisheye,
             width_px=width_px,
             height_px=height_px,
             source=f"assumed, since the drive does not show it: focal length {focal_px:.0f} px +- {sigma_rel:.0%}, "
-            f"{by}; {'equidistant' if known.fisheye else 'no distortion'}",
+            f"{by}; {shape}",
             sigma_focal_px=focal_px * sigma_rel,
         )
     if lens is None:
@@ -70,6 +84,7 @@ def lens_of_drive(
             "to be seen; --intrinsics, --chessboard or --camera name a lens"
         )
     focal = f"focal length {lens.focal_px:.0f} px +- {lens.focal_sigma_rel:.0%}"
+    lines = f", {uprights.edges} upright lines" if bend is not None and uprights is not None else ""
     shown = "by the drive" if lens.focal_shown else f"{by}; the drive turns too little to show it"
     return Intrinsics(
         fx_px=lens.focal_px,
@@ -82,7 +97,16 @@ def lens_of_drive(
         height_px=height_px,
         source=(
             f"the drive: {focal}, {shown}; k1 {lens.k1:+.3f} +- {lens.k1_sigma:.3f} "
-            f"(of {lens.windows} windows, {np.degrees(lens.turned_rad):.0f} deg turned)"
+            f"(of {lens.windows} windows, {np.degrees(lens.turned_rad):.0f} deg turned{lines})"
         ),
         sigma_focal_px=lens.focal_px * lens.focal_sigma_rel,
     )
+
+
+def with_uprights(known: FocalLength, uprights: LensByUprights | None, width_px: int) -> FocalLength:
+    """The focal length that a fisheye's upright lines show, where nobody states how wide the camera sees."""
+    if uprights is None or uprights.fisheye_focal is None or known.fisheye or known.sigma_rel < WIDE_SIGMA_REL:
+        return known
+    degrees = np.degrees(1.0 / uprights.fisheye_focal)
+    by = f"that of a fisheye {degrees:.0f} deg across, by {uprights.edges} upright lines"
+    return FocalLength(uprights.fisheye_focal * width_px, WIDE_SIGMA_REL, by, by_view=False, fisheye=True)

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
-from birdslam.loops.drift import moved
+from birdslam.loops.drift import link_cov
 from birdslam.loops.gnss.earth import Earth, EarthError, GnssFix, place_on_earth
 from birdslam.loops.gnss.factors import Node, OnEarth, fixed_keyframes, tie
 from birdslam.loops.keyframe import Link, Placed
@@ -81,7 +81,7 @@ def _nodes(way: Sequence[SE2]) -> tuple[list[Node], list[Link]]:
     for pose in way:
         step = nodes[-1].T_map_keyframe.between(pose)
         if math.hypot(step.x_m, step.y_m) >= SPACING_M:
-            links.append(Link(len(nodes) - 1, len(nodes), step, moved(np.zeros((3, 3)), step)))
+            links.append(Link(len(nodes) - 1, len(nodes), step, link_cov(step, 0.0)))
             nodes.append(Node(len(nodes), pose))
     return nodes, links
 

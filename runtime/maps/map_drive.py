@@ -5,7 +5,6 @@ The same for a drive that is over (drive_map.py) and for one that goes on (map_p
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,25 +21,9 @@ from birdslam.loops.session import MapSession
 from birdslam.outputs.map_trajectory import MapTrajectory, TrajectoryFiles
 from birdslam.outputs.placed import Place
 from birdslam.runtime.configuration import Configuration, ConfigurationError
+from birdslam.runtime.maps.held_way import HeldWay
 from birdslam.runtime.maps.map_store import check_map, write_map
 from birdslam.types import NS_PER_S, Estimate
-
-POSE_EVERY_M = 1.0  # of way: what is kept of a drive for its place on Earth
-MOST_POSES = 20_000  # of them; a longer drive keeps every second one, and so on
-
-Poses = list[tuple[int, SE2]]  # source time in ns, and the pose in one frame
-HELD_M = 30.0  # a pose moves with the keyframe that is so near
-
-
-@dataclass(frozen=True)
-class _Held:
-    """A pose of the drive, by the keyframe nearest to it: it moves with that."""
-
-    t_source_ns: int
-    epoch: int
-    T_odom_ego: SE2
-    keyframe: int | None  # its number; None: there was none yet, and the pose is in the map
-    T_keyframe_ego: SE2
 
 
 @dataclass(frozen=True)
@@ -80,9 +63,7 @@ class MapDrive:
     def __init__(self, choice: MapChoice, camera: Camera, output: Path) -> None:
         """Raises MapError, ConfigurationError, OSError."""
         self.map = choice.open(camera)
-        self._way: list[_Held] = []  # every metre, or every two and so on
-        self._every_m = POSE_EVERY_M
-        self._last: SE2 | None = None  # of them, in the map
+        self._way = HeldWay()
         self._choice = choice
         self._before = self._saved = len(self.map)
         self._session = MapSession(camera, self.map, choice.extend)
@@ -103,33 +84,14 @@ class MapDrive:
         if estimate.frame_id != self._frame_id:
             self._write(self._trajectory.add(found, estimate))
         self._frame_id = estimate.frame_id
-        if found.T_map_ego is not None and estimate.valid and self._is_further(found.T_map_ego):
-            self._hold(estimate, found.T_map_ego)
+        if found.T_map_ego is not None and estimate.valid:
+            self._way.add(estimate, found.T_map_ego, self.map)
         return found
-
-    def _hold(self, estimate: Estimate, T_map_ego: SE2) -> None:
-        self._last = T_map_ego
-        rows = self.map.near(T_map_ego, HELD_M)
-        keyframe = self.map.keyframes[rows[0]] if rows else None
-        T_keyframe_ego = T_map_ego if keyframe is None else keyframe.T_map_keyframe.between(T_map_ego)
-        number = None if keyframe is None else keyframe.number
-        held = _Held(estimate.t_source_ns, estimate.epoch, estimate.T_world_ego, number, T_keyframe_ego)
-        self._way.append(held)
-        if len(self._way) > MOST_POSES:
-            self._way = self._way[::2]
-            self._every_m *= 2.0
 
     @property
     def places(self) -> list[Place]:
         """The drive's way, every metre or so, as the map's keyframes lie now."""
-        at = {keyframe.number: keyframe.T_map_keyframe for keyframe in self.map.keyframes}
-        return [
-            Place(
-                *(held.t_source_ns, held.epoch, held.T_odom_ego),
-                held.T_keyframe_ego if held.keyframe is None else at[held.keyframe] @ held.T_keyframe_ego,
-            )
-            for held in self._way
-        ]
+        return self._way.places(self.map)
 
     def _write(self, settled: list[Localisation]) -> None:
         if self.unwritten is None:
@@ -137,10 +99,6 @@ class MapDrive:
                 self._files.write(settled)
             except OSError as error:
                 self.unwritten = error
-
-    def _is_further(self, T_map_ego: SE2) -> bool:
-        last = self._last
-        return last is None or math.hypot(T_map_ego.x_m - last.x_m, T_map_ego.y_m - last.y_m) >= self._every_m
 
     @property
     def T_map_odom(self) -> SE2 | None:

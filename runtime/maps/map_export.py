@@ -45,13 +45,13 @@ def export_map(place_map: PlaceMap, path: Path) -> str:
 
 
 def _g2o(place_map: PlaceMap) -> list[str]:
-    out = []
+    out, scales = [], {each.number: each.scale for each in place_map.keyframes}
     for keyframe in place_map.keyframes:
         T = keyframe.T_map_keyframe
         out.append(f"VERTEX_SE2 {keyframe.number} {T.x_m:.9g} {T.y_m:.9g} {T.yaw_rad:.9g}")
     for link in place_map.links:
         information = np.linalg.inv(link.cov + 1e-12 * np.eye(3))[np.triu_indices(3)]
-        T = link.T_from_to
+        T = link.T_from_to.scaled(scales[link.from_number])  # in metres of the map
         numbers = " ".join(f"{number:.9g}" for number in (T.x_m, T.y_m, T.yaw_rad, *information))
         out.append(f"EDGE_SE2 {link.from_number} {link.to_number} {numbers}")
     return out

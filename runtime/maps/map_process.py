@@ -46,7 +46,7 @@ TURN_S = 0.05  # what has come is taken up at least so often
 END_S = 2.0  # after SIGTERM, for the end of the source to come through
 HEALTH_NS = 1_000_000_000
 WAITING_ESTIMATES = 1024  # while a loop is closed
-WAITING_IMAGES = 4  # of frames whose estimates have not come yet
+WAITING_IMAGES = 4  # of frames whose estimates have not come yet: the oldest, however late estimates are
 CPU_SHARE = 0.5  # of one core, that looking at images may take in the long run; odometry carries the frames between
 SAVE_EVERY_S, SAVE_SHARE = 10.0, 0.02  # and a large map so seldom that writing it takes no more of the time
 NICENESS = 10  # all others go first
@@ -125,7 +125,7 @@ class LiveMap:
         """Pixels stay in the ring for a few frames only; of those that will not be looked at none is copied."""
         while (message := self._frames.recv(0.0)) is not None:
             ref: FrameRef = message.record
-            if ref.slot < 0 or ref.t_capture_ns < self._next_look_ns:
+            if ref.slot < 0 or ref.t_capture_ns < self._next_look_ns or len(self._images) == WAITING_IMAGES:
                 continue
             try:
                 image = self._ring.read(ref)
@@ -135,8 +135,6 @@ class LiveMap:
                 log.warning("frame %d is not looked at: %s", ref.frame_id, error)
                 image = None
             self.torn += image is None
-            while len(self._images) > WAITING_IMAGES:
-                self._images.popitem(last=False)
 
     def _step(self, estimate: Estimate) -> None:
         image = None
@@ -230,7 +228,7 @@ class LiveMap:
         except OSError as failure:
             reason = f"{self._output}: can't be written: {failure.strerror}"
         try:
-            summary["map"] = self._drive.summary()
+            summary["map"] = self._drive.summary() | {"looks": self.looks, "torn": self.torn}
             places = self._come_to_earth(summary)
             self._drive.write(summary["map"])
             write_places(self._output, places)

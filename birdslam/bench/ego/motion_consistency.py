@@ -40,7 +40,7 @@ class MotionConsistency(msgspec.Struct, frozen=True, kw_only=True):
     nees: float | None = None  # mean of e' P^-1 e over its degrees of freedom, the truth taken as exact
     nees_median: float | None = None  # its median over that of a consistent error: outliers of the truth do not count
     n_measured: int = 0  # of them those whose truth is no interpolation
-    nees_measured: float | None = None  # of these, the truth's own noise added to P
+    nees_measured: float | None = None  # of these, the truth's own noise and that of its axes added to P
     length_nees: float | None = None  # of the way's length alone, which is the scale's error; also of the measured
     length_nees_median: float | None = None  # over that of a consistent error
 
@@ -54,6 +54,7 @@ class MotionConsistencyReport(msgspec.Struct, frozen=True, kw_only=True):
     truth_implausible: int  # frames at which the truth accelerates as no car does
     truth_sigma_m: tuple[float, float]  # 1-sigma of the truth of one step, forwards and sideways
     truth_sigma_rad: float  # ... and of its yaw
+    truth_axes_off_rad: float | None = None  # from the truth's axes to its way on straight road; None: too little
 
 
 class Motions:
@@ -88,6 +89,7 @@ class Motions:
         interpolated = np.zeros(len(truth), np.bool_) if exact else truth_quality.interpolated(truth)
         sigma = np.zeros(DIMENSIONS) if exact else truth_quality.step_noise(truth, self._mount)
         noise = np.diag(sigma**2)
+        axes_rad = 0.0 if exact else truth_quality.AXES_SIGMA_RAD
         frames = [
             (first, last, cc.T_from_to, np.reshape(cc.cov, (DIMENSIONS, DIMENSIONS)))
             for last, (first, cc, measurements) in self._moved.items()
@@ -95,12 +97,13 @@ class Motions:
         ]
         implausible = truth_quality.implausible(truth, np.array(self._t_ns, np.int64))
         return MotionConsistencyReport(
-            frames=self._judge(frames, truth, interpolated, noise),
-            stretches=self._judge(self.stretches(truth), truth, interpolated, noise),
+            frames=self._judge(frames, truth, interpolated, noise, axes_rad),
+            stretches=self._judge(self.stretches(truth), truth, interpolated, noise, axes_rad),
             truth_interpolated=int(interpolated.sum()),
             truth_implausible=int(implausible.sum()),
             truth_sigma_m=(float(sigma[0]), float(sigma[1])),
             truth_sigma_rad=float(sigma[2]),
+            truth_axes_off_rad=truth_quality.axes_off_way(truth, self._mount),
         )
 
     def stretches(self, truth: Transform) -> list[tuple[int, int, SE2, Floats]]:
@@ -133,7 +136,12 @@ class Motions:
         return end
 
     def _judge(
-        self, motions: list[tuple[int, int, SE2, Floats]], truth: Transform, interpolated: Bools, noise: Floats
+        self,
+        motions: list[tuple[int, int, SE2, Floats]],
+        truth: Transform,
+        interpolated: Bools,
+        noise: Floats,
+        axes_rad: float,
     ) -> MotionConsistency:
         if not motions:
             return MotionConsistency(n=0)
@@ -144,7 +152,8 @@ class Motions:
             error = T_first_last.between(goal).log()
             plain.append(float(error @ np.linalg.solve(cov, error)))
             if not interpolated[first + 1 : last + 1].any():
-                measured.append(float(error @ np.linalg.solve(cov + noise, error)))
+                aside = moved_by_turn(T_first_last) * axes_rad
+                measured.append(float(error @ np.linalg.solve(cov + noise + np.outer(aside, aside), error)))
                 if (length_m := np.hypot(goal.x_m, goal.y_m)) > LEAST_M:
                     lengths.append(nees_of_length(T_first_last, cov + noise, float(length_m)))
         return MotionConsistency(
@@ -156,6 +165,12 @@ class Motions:
             length_nees=float(np.mean(lengths)) if lengths else None,
             length_nees_median=float(np.median(lengths)) / MEDIAN_LENGTH if lengths else None,
         )
+
+
+def moved_by_turn(T_first_last: SE2) -> Floats:
+    """(3,) how a motion, in the tangent at its end, goes with a turn of the axes in which its way is told (per rad)."""
+    x_m, y_m = T_first_last.rotation().T @ np.array([-T_first_last.y_m, T_first_last.x_m])
+    return np.array([x_m, y_m, 0.0])
 
 
 def nees_of_length(T_first_last: SE2, cov: Floats, truth_m: float) -> float:

@@ -16,16 +16,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from birdslam.geometry.arrays import Floats, Ints
+from birdslam.geometry.arrays import Ints
 from birdslam.geometry.se2 import SE2
-from birdslam.loops.closing import PlaceFactor, close_loops, inliers
+from birdslam.loops.closing import PlaceFactor, Solved, close_loops, inliers
 from birdslam.loops.gnss.earth import LEAST_FIXES, Earth, EarthError, GnssFix, fit
 from birdslam.loops.keyframe import Fixed, Link, Placed
 from birdslam.types import NS_PER_S
 
 REACH_M = 6.0  # from a fix to its keyframe, along the way
 SHARED_S = 10.0  # errors of fixes so near in time are one error; chosen on no data
-ROUNDS = 3  # of the scale
+ROUNDS = 2  # of the scale: keyframes have their own, and take up the rest
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,7 @@ class Node:
 
     number: int
     T_map_keyframe: SE2
+    scale: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +42,7 @@ class OnEarth:
     """What fixes made of a graph."""
 
     earth: Earth
-    poses: dict[int, tuple[SE2, Floats]]  # of each keyframe in the map, with its covariance
+    poses: dict[int, Solved]  # of each keyframe in the map
     fixed: dict[int, Fixed]  # the fixes that fit, by their keyframes
 
 
@@ -83,7 +84,7 @@ def tie(earth: Earth, keyframes: Sequence[Placed], links: Sequence[Link], fixed:
     for turn in range(ROUNDS):
         T_earth_map = SE2(earth.east_m / earth.scale, earth.north_m / earth.scale, earth.yaw_rad)
         flat = replace(earth, east_m=0.0, north_m=0.0, yaw_rad=0.0)  # east and north in metres of the map
-        nodes = [Node(each.number, T_earth_map @ each.T_map_keyframe) for each in keyframes]
+        nodes = [Node(each.number, T_earth_map @ each.T_map_keyframe, each.scale) for each in keyframes]
         factors = [
             PlaceFactor(
                 number, (float(x), float(y)), fixed[number].sigma_m / earth.scale, fixed[number].weighed_m / earth.scale
@@ -95,7 +96,7 @@ def tie(earth: Earth, keyframes: Sequence[Placed], links: Sequence[Link], fixed:
             raise EarthError(f"only {int(kept.sum())} of {len(kept)} fixes fit the drive's way")
         solved = close_loops(nodes, links, [factor for factor, fits in zip(factors, kept, strict=True) if fits])
         T_map_earth = first.T_map_keyframe @ solved[first.number][0].inverse()
-        poses = {number: (T_map_earth @ pose, cov) for number, (pose, cov) in solved.items()}
+        poses = {number: each._replace(T_map_keyframe=T_map_earth @ each[0]) for number, each in solved.items()}
         earth = _fitted(earth, poses, fixed, [number for number, fits in zip(numbers, kept, strict=True) if fits])
         if turn < ROUNDS - 1:
             earth = replace(earth, scale=earth.scale * _stretch(links, poses))
@@ -103,7 +104,7 @@ def tie(earth: Earth, keyframes: Sequence[Placed], links: Sequence[Link], fixed:
     return OnEarth(replace(earth, outliers=int((~kept).sum()), fixes=len(kept)), poses, fitting)
 
 
-def _stretch(links: Sequence[Link], poses: dict[int, tuple[SE2, Floats]]) -> float:
+def _stretch(links: Sequence[Link], poses: dict[int, Solved]) -> float:
     """By how much longer the fixes made odometry's links."""
     asked = total = 0.0
     for link in links:
@@ -114,7 +115,7 @@ def _stretch(links: Sequence[Link], poses: dict[int, tuple[SE2, Floats]]) -> flo
     return total / asked if asked else 1.0
 
 
-def _fitted(earth: Earth, poses: dict[int, tuple[SE2, Floats]], fixed: dict[int, Fixed], numbers: list[int]) -> Earth:
+def _fitted(earth: Earth, poses: dict[int, Solved], fixed: dict[int, Fixed], numbers: list[int]) -> Earth:
     """Earth by the keyframes as they lie now, and the fixes that fit."""
     flat = replace(earth, east_m=0.0, north_m=0.0, yaw_rad=0.0, scale=1.0)
     degrees = np.array([(fixed[number].latitude_deg, fixed[number].longitude_deg) for number in numbers])
