@@ -41,7 +41,7 @@ FARTHEST_M, LEAST_STEP_M = 1e5, 0.1
 # nor that all metres of the map are too long
 ALONG_REL, ASIDE_REL = 0.006, 0.02
 SHARED_YAW_RAD, ASIDE_YAW_RAD_PER_M = 0.0003, 0.0007
-SAME_POINTS_M = 4.0  # of way, along which fixes see the same points: all of them together tell as much as one
+SAME_POINTS_M = 2.0  # of way, along which fixes see the same points: all of them together tell as much as one
 # Of the way since the last fix where a frame was looked for and not found: an odometry that is right would have been
 MISSED_REL = 0.1
 
