@@ -24,12 +24,8 @@ from birdslam.loops.keyframe import Link, Placed
 DCS_PHI = 5.0  # chi-square at which a loop begins to count less
 # x, y, yaw, and the scale's logarithm
 ORIGIN_SIGMA = 1e-3, 1e-3, 1e-4, 1e1  # the map's frame is that of its first keyframe
-LOOSE_SIGMA = (
-    1e3,
-    1e3,
-    1e1,
-    1e-1,
-)  # of keyframes that only loops, or nothing, tie to the first: a loop may be switched off
+# ... of keyframes that only loops, or nothing, tie to the first: a loop may be switched off
+LOOSE_SIGMA = 1e3, 1e3, 1e1, 1e-1
 FREE_SIGMA = 1e6  # of what a prior says nothing of
 LOOP_SCALE_SIGMA = 1e1  # a place that is seen again tells nothing of odometry's metres there
 LEAST_WAY_M = 0.1  # of a link, over which the scale may change
