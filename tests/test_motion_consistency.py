@@ -115,6 +115,8 @@ def test_axes_that_are_turned_against_the_way_are_measured_on_straight_road_and_
     assert report.frames.nees_measured is not None
     assert report.frames.nees > 5.0 > 3.0 > report.frames.nees_measured > 0.5
     assert truth_quality.axes_off_way(drive([SE2(0.9, 0.0, 0.05)] * 200), MOUNT) is None  # a roundabout
+    for few in range(7):
+        assert truth_quality.axes_off_way(drive([SE2(0.9, 0.0, 0.0)] * few), MOUNT) is None
 
 
 def test_a_standing_cars_truth_is_no_interpolation() -> None:

@@ -22,6 +22,7 @@ _EVEN_RAD, _EVEN_STEPS = 3e-5, 4
 _DRIVES_M = 0.05  # in one step: a standing camera turns evenly as well
 ACCELERATION_MPS2 = 15.0  # no car changes its speed faster
 _STRAIGHT_PER_M, _STRAIGHT_M, _STEP_M = 0.003, 10.0, 0.3  # curvature of a straight road; its least way; of a step
+_BEND_STEPS = 5  # over which the curvature is taken
 # 1-sigma of the angle from the axes of poses by GPS/IMU to their way, from drive to drive: `axes_off_way` is +12, +2
 # mrad of KITTI odometry 00, 06 and -7, -9, -6, +3, +2, -3, +1, -4, -4 of tracking 0001-0006, 0008, 0010, 0018
 AXES_SIGMA_RAD = 0.006
@@ -72,10 +73,10 @@ def axes_off_way(poses: Transform, mount: GroundPlane) -> float | None:
     It is the camera's own yaw on the car, the same in all of a car's drives, and the error of the poses' headings.
     """
     moves = np.array([(step.x_m, step.y_m, step.yaw_rad) for step in steps(poses, mount)]).reshape(-1, 3)
-    if len(moves) == 0:
+    if len(moves) < _BEND_STEPS:
         return None
     way_m = np.hypot(moves[:, 0], moves[:, 1])
-    over = np.ones(5)  # steps, over which the curvature is taken
+    over = np.ones(_BEND_STEPS)
     bend = np.convolve(moves[:, 2], over, "same") / np.maximum(np.convolve(way_m, over, "same"), _DRIVES_M)
     straight = (way_m > _STEP_M) & (np.abs(bend) < _STRAIGHT_PER_M) & ~interpolated(poses)[1:]
     if way_m[straight].sum() < _STRAIGHT_M:
