@@ -18,6 +18,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.calibration.lens import WIDE_DEG
+
 Floats = NDArray[np.float64]
 
 _WIDTH_PX = 800  # of the image in which edges are looked for, at the most
@@ -29,7 +31,6 @@ _TILT_SIGMA = 0.05  # of the camera's pitch and roll beforehand
 _ROUNDS = 12  # of reweighting
 _BENDS = np.arange(-1.5, 0.51, 0.05)
 _VIEWS_DEG = np.arange(60.0, 161.0, 2.5)
-_FISHEYE_DEG = 100.0  # a fisheye that sees less is no other than a pinhole with distortion
 _SURE = 2.0  # sigmas by which a fisheye must fit better
 _WIDEST_RAD = 1.45  # from the axis
 
@@ -39,7 +40,8 @@ class LensByUprights:
     """What upright edges say of a lens, lengths in image widths.
 
     Of a pinhole with one radial term: radius = r (1 + bend r^2), which is k1 over the square of the focal length; with
-    its 1-sigma. `fisheye_focal` is the focal length of an equidistant lens where such a one fits better, else None.
+    its 1-sigma. `fisheye_focal` is the focal length of an equidistant lens where such a one fits better and
+    sees farther than pinholes do, else None: higher terms of a pinhole's distortion look like a narrower fisheye.
     """
 
     bend: float
@@ -84,7 +86,7 @@ def lens_by_uprights(images: Sequence[Floats]) -> LensByUprights | None:
     return LensByUprights(
         bend=bend,
         bend_sigma=math.hypot(spread, _LEAN_ERROR / _leverage(edges)),
-        fisheye_focal=0.5 / (0.5 * math.radians(view)) if sure and view >= _FISHEYE_DEG else None,
+        fisheye_focal=0.5 / (0.5 * math.radians(view)) if sure and view >= WIDE_DEG else None,
         edges=len(edges),
     )
 
