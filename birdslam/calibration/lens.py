@@ -27,6 +27,7 @@ from birdslam.calibration.lens_adjustment import (
     shared_by,
     some_corners,
 )
+from birdslam.calibration.travel import TravelPitch, pitch_by_travel
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import rotation_log
 from birdslam.odometry.corners.feature_tracks import FeatureConfig, FeatureTracker
@@ -72,7 +73,7 @@ class Lens:
 
     `u` are normalised coordinates; a `fisheye` has the angle from its axis in place of |u|, in u's direction.
     `turned_rad` is how far the camera turned within the windows, all together; `focal_shown` whether the drive itself
-    says more of the focal length than was known before.
+    says more of the focal length than was known before; `pitch` is the camera's, by the way it travels.
     """
 
     focal_px: float
@@ -84,6 +85,7 @@ class Lens:
     turned_rad: float
     focal_shown: bool
     fisheye: bool = False
+    pitch: TravelPitch | None = None
 
 
 @dataclass(frozen=True)
@@ -181,6 +183,7 @@ def self_calibrate(
         turned_rad=turned_rad,
         focal_shown=shown,
         fisheye=fisheye,
+        pitch=pitch_by_travel(fitted),
     )
 
 
