@@ -26,11 +26,11 @@ class TravelPitch(NamedTuple):
     sigma_rad: float
 
 
-def pitch_by_travel(problem: LensProblem) -> TravelPitch | None:
+def pitch_by_travel(problem: LensProblem, focal_sigma_rel: float) -> TravelPitch | None:
     """By the poses of the windows of a drive; None of less than a few.
 
     The median over the windows; its sigma by how far they scatter (the car bounces). Windows overlap by half, so that
-    half of them count.
+    half of them count. An angle from the axis is as sure as the focal length.
     """
     at = -np.einsum("wikj,wik->wij", problem.R, problem.t)  # (W, IMAGES, 3) of each image in its window's first camera
     steps = np.einsum("wikl,wil->wik", problem.R[:, :-1], np.diff(at, axis=1))
@@ -41,4 +41,4 @@ def pitch_by_travel(problem: LensProblem) -> TravelPitch | None:
     centre = float(np.median(pitch))
     spread = _NORMAL_PER_MAD * float(np.median(np.abs(pitch - centre)))
     of_median = math.sqrt(0.5 * math.pi / (0.5 * len(pitch)))  # of a normal distribution's median, by its sigma
-    return TravelPitch(centre, math.hypot(_TRAVEL_SIGMA_RAD, of_median * spread))
+    return TravelPitch(centre, math.hypot(_TRAVEL_SIGMA_RAD, of_median * spread, centre * focal_sigma_rel))
