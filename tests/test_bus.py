@@ -144,7 +144,8 @@ def test_messages_that_wait_behind_many_are_kept_as_bytes_and_come_out_the_same(
     for frame_id in range(40):
         out.put(measurements(frame_id))
     until(lambda: queue.newest and queue.newest.record.frame_id == 39, "the last record")
-    assert sum(not hasattr(waiting, "record") for waiting in queue._queue) == 40 - UNPACKED
+    waiting = list(queue._queue)  # private: what waits shows in memory alone
+    assert sum(not hasattr(each, "record") for each in waiting) == 40 - UNPACKED
     came = [received(queue) for _ in range(40)]
     assert [message.record for message in came] == [measurements(frame_id) for frame_id in range(40)]
     assert [message.trace.number for message in came] == list(range(1, 41))
