@@ -25,6 +25,11 @@ EXAMPLES = Path(__file__).resolve().parent.parent / "docs" / "examples"
 FRAMES = 12
 
 
+@pytest.mark.parametrize(("name", "most"), [("speeds.py", 25), ("stop_for_people.py", 20)])
+def test_an_example_is_as_short_as_it_says(name: str, most: int) -> None:
+    assert sum(bool(line.strip()) for line in (EXAMPLES / name).read_text().splitlines()) <= most
+
+
 def test_the_program_draws_metres_over_a_film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recording = open_recording("demo")
     network = load_network("multitask", ModelSpec(str(SHIPPED_NETWORKS / SHIPPED_MULTITASK)))

@@ -201,6 +201,8 @@ def test_all_three_kinds_of_file_are_read(tmp_path: Path) -> None:
         ("1.5,5,10,20,30,40,0.9\n", "line 1: '1.5' is no whole number"),
         ("1,5,10,20,30,40,0.9\n1,5,50,20,30,40,0.9\n", "line 1 to line 2: track_ids"),
         ("0 5 Car 0 0 -10 10 20 40\n", "line 1: has 9 columns"),
+        ("0 5 Car 0 0 0 1 2 3 4\n0 6 car 0 0 0 5 2 9 4\n", "line 2: type car is none of Car, Van"),
+        ('[{"image_id": 0, "category_id": 0, "bbox": [1, 2, 3, 4], "score": 1}]', "category_id 0 is not in 1 to 90"),
         ("", "holds no boxes"),
         ("[{]", "is no JSON"),
         ('{"images": []}', "are a list"),

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import os
+import signal
 import socket
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 import msgspec
+import psutil
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -16,7 +20,9 @@ from birdslam.runtime.configuration import Configuration, RuntimeConfig, SourceC
 from birdslam.runtime.process.notify import Notifier
 from birdslam.runtime.process.restarts import EpochFile, Restarts, Resume
 from birdslam.runtime.process.vitals import Vitals
-from birdslam.runtime.supervision.stations import MISSED_RECORDS, Intake
+from birdslam.runtime.supervision.processes import starved_s
+from birdslam.runtime.supervision.stations import MISSED_RECORDS, Intake, Silence
+from tests.test_bus import until
 
 CONFIG = RuntimeConfig(restarts_max=3, restart_window_s=10.0, restart_backoff_ms=100.0, restart_backoff_max_ms=150.0)
 
@@ -102,6 +108,31 @@ def test_a_loop_that_stands_still_misses_nothing_yet() -> None:
     told = [intake.missed(10 * k, 7, 0.1 * k - 0.2, 0.1 * k, 1.5) for k in range(3, 17)]
     assert not any(told)  # at 1.5 s without a beat it is stalled
     assert intake.missed(170, 7, 0.05, 1.7, 1.5) == 170  # it only was slow, and has beaten since
+
+
+def test_a_loop_that_waits_for_a_core_is_not_silent() -> None:
+    silence = Silence()
+    assert silence.own_s(beat_ns=1, silent_s=0.0, starved_s=5.0) == 0.0  # it waited before, and has beaten since
+    assert silence.own_s(beat_ns=1, silent_s=40.0, starved_s=44.0) == 1.0  # all others went first
+    assert silence.own_s(beat_ns=1, silent_s=80.0, starved_s=44.0) == 41.0  # then it stood still by itself
+    assert silence.own_s(beat_ns=2, silent_s=3.0, starved_s=44.0) == 3.0
+
+
+@pytest.mark.processes
+def test_linux_says_how_long_a_process_waited_for_a_core() -> None:
+    spin = "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\nwhile True: pass"
+    spinning, stopped = (subprocess.Popen([sys.executable, "-c", spin]) for _ in range(2))
+    try:
+        until(lambda: min(starved_s(spinning.pid), starved_s(stopped.pid)) > 0.05, "two on one core wait in turn")
+        stopped.send_signal(signal.SIGSTOP)
+        until(lambda: psutil.Process(stopped.pid).status() == psutil.STATUS_STOPPED, "it is stopped")
+        before_s, ran_s = starved_s(stopped.pid), psutil.Process(spinning.pid).cpu_times().user
+        until(lambda: psutil.Process(spinning.pid).cpu_times().user > ran_s + 0.05, "the other goes on")
+        assert starved_s(stopped.pid) == before_s
+    finally:
+        for process in (spinning, stopped):
+            process.kill()
+            process.wait()
 
 
 @pytest.fixture

@@ -27,6 +27,7 @@ from birdslam.calibration.lens_adjustment import (
     shared_by,
     some_corners,
 )
+from birdslam.calibration.travel import TravelPitch, pitch_by_travel
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import rotation_log
 from birdslam.odometry.corners.feature_tracks import FeatureConfig, FeatureTracker
@@ -36,9 +37,10 @@ from birdslam.odometry.working_resolution import WorkingResolution
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-# So far _MOVED of the corners have moved from one image of a window to the next; of short drives less
-_STEPS_RAD = 0.016, 0.012
-_MOVED = 0.4
+# So far this share of the corners has moved from one image of a window to the next; of short drives less, and of lenses
+# that see so far across that near corners are soon gone
+_MOVED, _MOVED_WIDE = 0.4, 0.15
+_STEPS_RAD = (0.016, _MOVED), (0.012, _MOVED), (0.012, _MOVED_WIDE)
 _FIXED_RAD = 0.003  # a corner that moves by less over a window is far off, or on the windscreen or bonnet
 _MOST_WINDOWS = 40
 _LEAST_WINDOWS = 4
@@ -72,7 +74,7 @@ class Lens:
 
     `u` are normalised coordinates; a `fisheye` has the angle from its axis in place of |u|, in u's direction.
     `turned_rad` is how far the camera turned within the windows, all together; `focal_shown` whether the drive itself
-    says more of the focal length than was known before.
+    says more of the focal length than was known before; `pitch` is the camera's, by the way it travels.
     """
 
     focal_px: float
@@ -84,6 +86,7 @@ class Lens:
     turned_rad: float
     focal_shown: bool
     fisheye: bool = False
+    pitch: TravelPitch | None = None
 
 
 @dataclass(frozen=True)
@@ -150,9 +153,9 @@ def self_calibrate(
         k1_before = k1_by_bend(bend, focal_px / size_px[0])
     middle = 0.5 * (np.array(size_px, dtype=np.float64) - 1.0)
     windows: list[_Window] = []
-    for step_rad in _STEPS_RAD:
+    for step_rad, share in _STEPS_RAD:
         if len(windows) < 2 * _LEAST_WINDOWS:
-            windows = _windows(images, middle, step_rad * focal_px)
+            windows = _windows(images, middle, step_rad * focal_px, share)
     sigma_px = _SIGMA_PX * focal_px / _FOCAL_PX
     begun = _begin(windows, focal_px, k1_before[0], sigma_px, fisheye, k1_before)
     if begun is None:
@@ -171,16 +174,19 @@ def self_calibrate(
         sigmas_found = _sigmas(found, prior)
         shown = bool(max(sigmas_found[1], LEAST_SIGMA_REL) < _SHOWN * focal_sigma_rel)
         fitted, sigmas = (found, sigmas_found) if shown else (fitted, sigmas)
+    if shown:
+        focal_sigma_rel = max(float(sigmas[1]), LEAST_SIGMA_REL)
     return Lens(
         focal_px=math.exp(fitted.log_focal),
         k1=fitted.k1,
-        focal_sigma_rel=max(float(sigmas[1]), LEAST_SIGMA_REL) if shown else focal_sigma_rel,
+        focal_sigma_rel=focal_sigma_rel,
         k1_sigma=min(max(LEAST_SIGMA_K1, float(sigmas[0])), k1_before[1]),
         windows=len(fitted.R),
         corners=len(fitted.px),
         turned_rad=turned_rad,
         focal_shown=shown,
         fisheye=fisheye,
+        pitch=pitch_by_travel(fitted, focal_sigma_rel),
     )
 
 
@@ -236,8 +242,8 @@ def _shared_without(problem: LensProblem, prior: FocalPrior, some: NDArray[np.bo
 # --- windows ---
 
 
-def _windows(images: Sequence[CornersOfImage], middle: Floats, step_px: float) -> list[_Window]:
-    """Windows of the drive, each of images between which corners have moved by a step."""
+def _windows(images: Sequence[CornersOfImage], middle: Floats, step_px: float, share: float) -> list[_Window]:
+    """Windows of the drive, each of images between which a share of the corners has moved by a step."""
     found, first = [], 0
     while first < len(images) - IMAGES:
         at = [first]
@@ -245,14 +251,14 @@ def _windows(images: Sequence[CornersOfImage], middle: Floats, step_px: float) -
             moved = _flow_px(images[at[-1]], images[k])
             if len(moved) < _LEAST_CORNERS:
                 break
-            if np.quantile(moved, 1.0 - _MOVED) > step_px:
+            if np.quantile(moved, 1.0 - share) > step_px:
                 at.append(k)
             if len(at) == IMAGES:
                 break
         if len(at) < IMAGES:
             first += 1
             continue
-        window = _common(images, at, middle, step_px / _STEPS_RAD[0] * _FIXED_RAD)
+        window = _common(images, at, middle, step_px / _STEPS_RAD[0][0] * _FIXED_RAD)
         if window is not None:
             found.append(window)
         first = at[IMAGES // 2]

@@ -54,9 +54,7 @@ class MapSession:
         self._travelled_m = 0.0
         self._looked_m, self._looked_ns = -math.inf, -(1 << 62)
         self._own: list[tuple[int, float]] = []  # rows of this drive's keyframes, and the way at each
-        self._chain: tuple[int, SE2, float] | None = (
-            None  # the last keyframe's number, its T_odom_keyframe, Look.unsure_m2
-        )
+        self._chain: tuple[int, SE2, float] | None = None  # the last keyframe: number, T_odom_keyframe, Look.unsure_m2
         self._linked_m, self._joint_m = -math.inf, -math.inf
         self._fixes: list[tuple[float, SE2, int, SE2, Floats]] = []
         self._open_loops, self._closed_m = 0, -math.inf  # loops since the last optimisation, and the way there

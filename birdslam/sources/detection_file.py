@@ -21,7 +21,10 @@ from birdslam.sources.recording import DatasetError, Recording
 
 # COCO's category ids of who is on a road; others are boxes without a meaning here
 COCO = {1: "person", 2: "bicycle", 3: "car", 4: "motorcycle", 6: "bus", 8: "truck"}
+COCO_LAST = 90
+# KITTI's types: who is on a road, and what else its text may name, which has no meaning here
 KITTI = {"Car": "car", "Van": "van", "Truck": "truck", "Pedestrian": "person", "Person": "person", "Cyclist": "cyclist"}
+KITTI_OTHERS = ("Person_sitting", "Tram", "Misc", "DontCare")
 _MOST_BYTES = 1 << 30
 _MOT_COLUMNS, _KITTI_COLUMNS, _KITTI_SCORE = 7, 10, 17
 
@@ -104,10 +107,12 @@ def _mot(words: list[str]) -> _Box:
 def _kitti(words: list[str]) -> _Box:
     if len(words) < _KITTI_COLUMNS:
         raise ValueError(f"has {len(words)} columns, KITTI's text has {_KITTI_COLUMNS} at the least")
-    frame, track = _whole(words[0]), _whole(words[1])
+    frame, track, kind = _whole(words[0]), _whole(words[1]), words[2]
+    if kind not in KITTI and kind not in KITTI_OTHERS:
+        raise ValueError(f"type {kind} is none of {', '.join((*KITTI, *KITTI_OTHERS))}")
     x1, y1, x2, y2 = (float(word) for word in words[6:_KITTI_COLUMNS])
     score = float(words[_KITTI_SCORE]) if len(words) > _KITTI_SCORE else 1.0
-    return _checked(_Box(frame, max(track, -1), KITTI.get(words[2], words[2].lower()), (x1, y1, x2, y2), score))
+    return _checked(_Box(frame, max(track, -1), KITTI.get(kind, kind.lower()), (x1, y1, x2, y2), score))
 
 
 def _coco(path: Path, text: str) -> Iterator[tuple[str, _Box]]:
@@ -127,6 +132,8 @@ def _coco(path: Path, text: str) -> Iterator[tuple[str, _Box]]:
 def _coco_box(entry: dict[str, Any]) -> _Box:
     left, top, width, height = (float(number) for number in entry["bbox"])
     category = _whole(entry["category_id"])
+    if not 1 <= category <= COCO_LAST:
+        raise ValueError(f"category_id {category} is not in 1 to {COCO_LAST}")
     box_px = left, top, left + width, top + height
     track = _whole(entry.get("track_id", -1))
     label = COCO.get(category, f"coco {category}")

@@ -1,6 +1,4 @@
-"""Distances and speeds of another detector's boxes: python speeds.py VIDEO CAMERA.toml BOXES OUT.mp4 (pip install
-'birdslam[supervision]'). BOXES is a file of MOT, KITTI or COCO (docs/networks.md); a detector in Python hands over its
-`supervision.Detections` in its place."""
+"""Distance and speed of a detector's boxes, drawn: python speeds.py VIDEO CAMERA.toml BOXES OUT.mp4 (docs/api.md)"""
 
 import sys
 from pathlib import Path
@@ -9,21 +7,19 @@ import supervision as sv
 
 from birdslam import BirdSLAM, load_camera, open_recording
 from birdslam.integrations.supervision import add_metres, from_supervision
+from birdslam.perception.schedule import NO_DETECTIONS
 from birdslam.sources.detection_file import read_detection_file
 
 video, camera_file, boxes_file, output = sys.argv[1:]
-recording = open_recording(f"video:{video}", load_camera(Path(camera_file)))
-slam, boxes = BirdSLAM.with_shipped_networks(recording.camera, recording.rate_hz), read_detection_file(Path(boxes_file))
-draw_box, draw_label = (kind(color_lookup=sv.ColorLookup.INDEX) for kind in (sv.BoxAnnotator, sv.LabelAnnotator))
-size = sv.VideoInfo(recording.camera.width_px, recording.camera.height_px, recording.rate_hz)
-with sv.VideoSink(output, size) as sink:
+camera, boxes = load_camera(Path(camera_file)), read_detection_file(Path(boxes_file))
+recording = open_recording(f"video:{video}", camera)
+slam = BirdSLAM.with_shipped_networks(camera, recording.rate_hz)
+draw_box, draw_text = (kind(color_lookup=sv.ColorLookup.INDEX) for kind in (sv.BoxAnnotator, sv.LabelAnnotator))
+with sv.VideoSink(output, sv.VideoInfo(camera.width_px, camera.height_px, recording.rate_hz)) as sink:
     for frame in recording.undistorted_frames():
-        found = boxes.get(frame.frame_id)
-        detections = sv.Detections.empty() if found is None else sv.Detections(found.boxes_px, confidence=found.scores)
-        detections.data["class_name"] = [] if found is None else list(found.labels)
-        measurements, estimate, placed = slam.step(frame, from_supervision(detections))
-        add_metres(detections, placed)
-        labels = [
-            f"{m:.0f} m {v:.0f} m/s" for m, v in zip(detections["distance_m"], detections["speed_mps"], strict=True)
-        ]
-        sink.write_frame(draw_label.annotate(draw_box.annotate(frame.image.copy(), detections), detections, labels))
+        found = boxes.get(frame.frame_id, NO_DETECTIONS)  # a detector in Python gives its sv.Detections here
+        names = {"class_name": list(found.labels)}
+        seen = sv.Detections(found.boxes_px, None, found.scores, tracker_id=found.track_ids, data=names)
+        add_metres(seen, slam.step(frame, from_supervision(seen))[2])
+        texts = [f"{m:.0f} m {v:.0f} m/s" for m, v in zip(seen["distance_m"], seen["speed_mps"], strict=True)]
+        sink.write_frame(draw_text.annotate(draw_box.annotate(frame.image.copy(), seen), seen, texts))

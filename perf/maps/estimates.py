@@ -18,7 +18,7 @@ from birdslam.runtime.wire import decode, encode
 from birdslam.types import Estimate
 
 KEPT = "estimates.msgpack"
-CODE = "birdslam.slam.BirdSLAM", "birdslam.runtime.batch.offline.pipeline"  # that estimates come from; no map
+CODE = ("birdslam.slam.BirdSLAM",)  # that estimates come from: the method, without what opens files, and no map
 
 Seen = tuple[Estimate, NDArray[np.uint8]]
 

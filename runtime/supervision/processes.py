@@ -136,6 +136,14 @@ class NodeProcess:
         self.vitals.close()
 
 
+def starved_s(pid: int) -> float:
+    """For which a process' main thread has been ready to run and waited for a core; 0 where Linux does not say."""
+    try:
+        return int(Path(f"/proc/{pid}/schedstat").read_text().split()[1]) / 1e9
+    except (OSError, IndexError):
+        return 0.0
+
+
 def _message(line: str) -> str:
     """A log line without its date and level."""
     for level in _REPORTED_LEVELS:

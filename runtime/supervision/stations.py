@@ -14,7 +14,7 @@ import msgspec
 from birdslam.runtime.configuration import Configuration
 from birdslam.runtime.process import realtime
 from birdslam.runtime.process.restarts import Assignment, Restarts
-from birdslam.runtime.supervision.processes import NodeLog, NodeProcess
+from birdslam.runtime.supervision.processes import NodeLog, NodeProcess, starved_s
 from birdslam.runtime.transport.presence import remove_socket, runtime_dir_of
 
 _SUMMED = ("frames", "dropped", "malformed", "torn", "coasted", "outrun", "speeds", "speeds_dropped")
@@ -64,6 +64,20 @@ class Intake:
         return missed if missed >= MISSED_RECORDS and late else 0
 
 
+class Silence:
+    """How long a loop beside the pipeline has shown no life: without the time for which it waited for a core, since all
+    others go first, and the next process would wait as long."""
+
+    def __init__(self) -> None:
+        self._beat_ns, self._starved_s = -1, 0.0
+
+    def own_s(self, beat_ns: int, silent_s: float, starved_s: float) -> float:
+        """`starved_s`: for which it has waited for a core since it began."""
+        if beat_ns != self._beat_ns:
+            self._beat_ns, self._starved_s = beat_ns, starved_s
+        return silent_s - (starved_s - self._starved_s)
+
+
 class Station:
     """One node of a run, or its recorder, through all of its processes; it begins at once."""
 
@@ -74,7 +88,7 @@ class Station:
         self.restarts = Restarts(configuration.runtime)
         self.due_s: float | None = None  # of the next process, where there is none
         self._config = configuration
-        self._intake = Intake()
+        self._intake, self._silence = Intake(), Silence()
         self._spare: NodeProcess | None = None
         self._spare_due_s = 0.0
         self.stall = ""  # why the process at work was ended by the watchdog
@@ -161,6 +175,8 @@ class Station:
             return ""
         self.was_ready = self.was_ready or process.ready
         silent_s = process.silent_s()
+        if not self.duty.essential:
+            silent_s = self._silence.own_s(process.vitals["beat_ns"], silent_s, starved_s(process.pid))
         if silent_s > limit_s:
             return f"is stalled: its loop has shown no life for {1e3 * limit_s:g} ms"
         if before is not None and process.ready:
