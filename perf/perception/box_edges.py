@@ -3,13 +3,8 @@
     python -m perf box_edges [--places] [--data DIR] [--models DIR] [--output F.json]
     python -m perf box_edges --boxes FILE --truth FILE
 
-The families are those of `birdslam.perception.families`, measured on KITTI tracking: RRC's boxes of sixteen sequences,
-and boxes of two networks on the images of 0002 and 0005, as they leave the network. `--boxes` and `--truth` are files
-as `birdslam run --detections` takes them. An edge's difference is taken beside sqrt((rel * side)^2 + px^2), wider as
-the score falls: `rel` is the least by which 68 % of the edges are within it and 95 % within twice it, its mean error
-counted in, `px` what makes large and small boxes alike. Each sequence, of networks each half of one, is also judged by
-what the others give, and by what its family has. `--places`: the front end's depths of cars by the one sigma for all
-and by their family's, how many are within one and two of their own sigmas.
+RRC's recorded boxes of KITTI tracking, and boxes of two networks on 0002 and 0005 as they leave the network; files are
+as `run --detections` takes them. `--places`: the front end's depths of cars, too. `fitted` says what a sigma is.
 """
 
 from __future__ import annotations
@@ -81,7 +76,12 @@ def joined(parts: Iterable[Edges]) -> Edges:
 
 
 def fitted(edges: Edges) -> EdgeSigma:
-    """The sigma of these edges: rounded up to RELS."""
+    """Of an edge the sigma is sqrt((rel * side)^2 + px^2), wider as the score falls (`wider`).
+
+    `rel` is the least of RELS by which 68 % of the edges are within it and 95 % within twice it, their mean error counted
+    in; `px` of PX what makes small and large boxes alike. Each sequence, of networks each half of one, is judged by what
+    the others give, and by what its family has.
+    """
 
     def least(px: float) -> list[float]:
         rels = []
