@@ -78,9 +78,9 @@ def joined(parts: Iterable[Edges]) -> Edges:
 def fitted(edges: Edges) -> EdgeSigma:
     """Of an edge the sigma is sqrt((rel * side)^2 + px^2), wider as the score falls (`wider`).
 
-    `rel` is the least of RELS by which 68 % of the edges are within it and 95 % within twice it, their mean error counted
-    in; `px` of PX what makes small and large boxes alike. Each sequence, of networks each half of one, is judged by what
-    the others give, and by what its family has.
+    `rel` is the least of RELS by which 68 % of the edges are within it and 95 % within twice it, their mean error
+    counted in; `px` of PX what makes small and large boxes alike. Each sequence, of networks each half of one, is
+    judged by what the others give, and by what its family has.
     """
 
     def least(px: float) -> list[float]:
