@@ -83,6 +83,8 @@ GROUPS = (
             "models.completion": "Are lanes completed where something hid the road (ENet)?",
             "source.detections": "Which file has another detector's boxes, in place of a network's? MOT, KITTI "
             'tracking or COCO results; "": none',
+            "source.detector": "Which family is that detector of, by which its boxes' edges are more or less sure? "
+            "configured: by slam.frontend.localisation.sigma_box_rel and sigma_box_px",
             "runtime.models_dir": 'Where do installed networks lie? "": in the user\'s own folder',
         },
     ),

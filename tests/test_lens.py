@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from birdslam.calibration.lens import CornersOfImage, Lens, focal_by_field_of_view, self_calibrate
+from birdslam.calibration.lens import Lens, focal_by_field_of_view, self_calibrate
+from birdslam.calibration.lens_windows import CornersOfImage
 from birdslam.geometry.camera import Camera
 from birdslam.runtime.calibration.given import Given, focal_length_of
 

@@ -21,7 +21,8 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from birdslam.calibration.lens import CornersOfImage, followed_corners, self_calibrate
+from birdslam.calibration.lens import self_calibrate
+from birdslam.calibration.lens_windows import CornersOfImage, followed_corners
 from birdslam.calibration.uprights import UPRIGHT_IMAGES, lens_by_uprights, upright_edges
 from birdslam.geometry.camera import Camera, Undistorter
 from birdslam.odometry.odometry import Odometry

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from birdslam.calibration.calibration import CalibrationError
 from birdslam.calibration.intrinsics import Intrinsics
-from birdslam.calibration.lens import WIDE_SIGMA_REL, followed_corners, k1_by_bend, self_calibrate
+from birdslam.calibration.lens import WIDE_SIGMA_REL, k1_by_bend, self_calibrate
 from birdslam.calibration.lens_adjustment import IMAGES
+from birdslam.calibration.lens_windows import followed_corners
 from birdslam.calibration.travel import TravelPitch
 from birdslam.calibration.uprights import UPRIGHT_IMAGES, LensByUprights, lens_by_uprights, upright_edges
 from birdslam.geometry.arrays import Floats
