@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 
 from birdslam.geometry.arrays import Floats, Ints
+from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2, wrap
 from birdslam.loops.map_pose import EarthPose
 from birdslam.types import NS_PER_S
@@ -25,7 +26,7 @@ DELAY_SIGMA_S = 0.5
 WINDOW_S, MOST_WINDOWS = 60.0, 10  # in which fixes are compared with odometry for their delay
 ITERATIONS, WINDOW_ITERATIONS = 30, 16
 DEFAULT_SIGMA_M = 5.0  # of a fix that does not say its own
-HINT_SIGMAS, HINT_REL = 3.0, 0.02  # a wrong height is reported where it is that sure, and that large
+HINT_SIGMAS, HINT_REL = 3.0, 0.02  # a wrong height, or view, is reported where it is that sure, and that large
 
 
 class GnssFix(msgspec.Struct, frozen=True, kw_only=True):
@@ -120,15 +121,27 @@ class Earth:
             yaw_sigma_rad=math.sqrt(self.cov[2, 2] + cov[2, 2]),
         )
 
-    def height_hint(self, height_m: float) -> str:
-        """What the metres of the fixes say of the camera's height; "" where they say nothing against it."""
+    def calibration_hint(self, camera: Camera) -> str:
+        """What the metres of the fixes say of the camera's file; "" where they say nothing against it.
+
+        Our metres are in proportion to the height, and about to the focal length: a straight way can't tell which.
+        """
         sigma = math.sqrt(self.cov[3, 3])
         if abs(math.log(self.scale)) < max(HINT_SIGMAS * sigma, HINT_REL):
             return ""
+        height_m = camera.height_m
+        now_deg, fits_deg = (_view_deg(camera, scale) for scale in (1.0, self.scale))
         return (
             f"camera height {height_m * self.scale:.2f} m instead of {height_m:.2f} m fits GNSS "
-            f"(within {height_m * self.scale * 2.0 * sigma:.2f} m)"
+            f"(within {height_m * self.scale * 2.0 * sigma:.2f} m); or, if the height was measured, a view of "
+            f"{fits_deg:.0f} degrees across instead of {now_deg:.0f}"
         )
+
+
+def _view_deg(camera: Camera, scale: float) -> float:
+    """Across, by a focal length so many times the camera's; its distortion left out, as where a view is stated."""
+    half = 0.5 * camera.width_px / (scale * camera.fx_px)
+    return 2.0 * math.degrees(half if camera.fisheye else math.atan(half))
 
 
 def place_on_earth(t_ns: Ints, poses: list[SE2], fixes: list[GnssFix]) -> Earth:
