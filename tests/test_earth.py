@@ -7,6 +7,7 @@ from pathlib import Path
 
 import geojson
 import gpxpy
+import msgspec
 import numpy as np
 import pymap3d
 import pytest
@@ -77,6 +78,16 @@ def test_a_wrong_camera_height_is_told() -> None:
     assert earth.scale == pytest.approx(0.94, abs=0.01)
     assert "1.55 m instead of 1.65 m" in earth.calibration_hint(CAMERA)
     assert "a view of 85 degrees across instead of 82" in earth.calibration_hint(CAMERA)
+
+
+def test_speeds_of_fixes_show_the_scale_where_their_places_hardly_do() -> None:
+    t_ns, poses, enu = a_drive(scale=0.94)
+    fixes = [msgspec.structs.replace(fix, sigma_m=30.0) for fix in fixes_of(t_ns, enu, 20.0)]
+    by_places = place_on_earth(t_ns, poses, fixes)
+    by_speeds = place_on_earth(t_ns, poses, [msgspec.structs.replace(fix, speed_mps=10.0) for fix in fixes])
+    assert by_speeds.speed_ratio == pytest.approx(1.0 / 0.94, abs=0.01)
+    assert by_speeds.scale == pytest.approx(0.94, abs=0.02)
+    assert by_speeds.cov[3, 3] < 0.1 * by_places.cov[3, 3]
 
 
 def test_late_fixes_are_found_out_by_the_turn() -> None:
