@@ -24,6 +24,7 @@ from birdslam.geometry.se2 import SE2
 from birdslam.runtime.client import Planner, Reading
 from birdslam.runtime.topology import key_of
 from birdslam.runtime.transport.bus import Bus, BusClosed, BusError, MessagesLost, Subscriber
+from birdslam.runtime.transport.endpoints import UNPACKED
 from birdslam.runtime.transport.presence import VehicleBusy, VehicleLock, ring_path, runtime_dir_of, socket_path
 from birdslam.runtime.wire import MAX_MESSAGE_BYTES, Stage, Trace, encode
 from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, Status
@@ -133,6 +134,22 @@ def test_a_bounded_queue_keeps_the_last_and_counts_the_rest(join: Any) -> None:
     assert [received(queue).record.frame_id for _ in range(8)] == list(range(12, 20))
     assert [received(short).record.frame_id for _ in range(2)] == [18, 19]
     assert (queue.dropped, short.dropped) == (12, 18)
+
+
+def test_messages_that_wait_behind_many_are_kept_as_bytes_and_come_out_the_same(join: Any) -> None:
+    hub = join("supervisor", hub=True)
+    queue = hub.subscriber("measurements", depth=64)
+    out = join("perceive", lossless=True).publisher("measurements")
+    assert out.wait_matched(LIMIT_S)
+    for frame_id in range(40):
+        out.put(measurements(frame_id))
+    until(lambda: queue.newest and queue.newest.record.frame_id == 39, "the last record")
+    waiting = list(queue._queue)  # private: what waits shows in memory alone
+    assert sum(not hasattr(each, "record") for each in waiting) == 40 - UNPACKED
+    came = [received(queue) for _ in range(40)]
+    assert [message.record for message in came] == [measurements(frame_id) for frame_id in range(40)]
+    assert [message.trace.number for message in came] == list(range(1, 41))
+    assert queue.dropped == 0
 
 
 def test_malformed_messages_are_counted_and_survived(join: Any, base: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -17,7 +17,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from birdslam.calibration.lens import CornersOfImage, Lens, followed_corners, self_calibrate
+from birdslam.calibration.lens import Lens, self_calibrate
+from birdslam.calibration.lens_windows import CornersOfImage, followed_corners
 from birdslam.geometry.camera import Undistorter
 from birdslam.odometry.odometry import Odometry
 from birdslam.perf.accuracy.drives import is_valid

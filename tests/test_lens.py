@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from birdslam.calibration.lens import CornersOfImage, Lens, focal_by_field_of_view, self_calibrate
+from birdslam.calibration.lens import Lens, focal_by_field_of_view, self_calibrate
+from birdslam.calibration.lens_windows import CornersOfImage
 from birdslam.geometry.camera import Camera
 from birdslam.runtime.calibration.given import Given, focal_length_of
 
@@ -18,7 +19,13 @@ NOISE_PX = 0.3
 
 
 def drive(
-    k1: float, turn_rad: float, images: int = 66, step_m: float = 0.8, seed: int = 0, focal_px: float = FOCAL_PX
+    k1: float,
+    turn_rad: float,
+    images: int = 66,
+    step_m: float = 0.8,
+    seed: int = 0,
+    focal_px: float = FOCAL_PX,
+    pitch_rad: float = 0.0,
 ) -> list[CornersOfImage]:
     """Corners of a street's facades and ground, by a camera that turns to both sides, `turn_rad` together."""
     rng = np.random.default_rng(seed)
@@ -34,7 +41,7 @@ def drive(
             heading += turn_rad / images * (1.0 if (k // (images // 3)) % 2 == 0 else -1.0)
             at = at + step_m * np.array([math.sin(heading), 0.0, math.cos(heading)])
         R = cv2.Rodrigues(np.array([0.0, heading, 0.0]))[0]
-        q = (places - at) @ R
+        q = (places - at) @ R @ cv2.Rodrigues(np.array([-pitch_rad, 0.0, 0.0]))[0]
         ahead = (q[:, 2] > 2.0) & (q[:, 2] < 90.0)
         u = q[:, :2] / np.where(ahead, q[:, 2], 1.0)[:, None]
         r2 = np.square(u).sum(axis=1, keepdims=True)
@@ -68,6 +75,14 @@ def test_a_straight_drive_shows_the_distortion_and_no_focal_length() -> None:
     assert (lens.focal_px, lens.focal_sigma_rel) == (pytest.approx(FOCAL_PX), 0.15)
     assert lens.turned_rad < math.radians(15.0)
     assert abs(lens.k1 + 0.3) < 3.0 * lens.k1_sigma
+
+
+@pytest.mark.parametrize("pitch_rad", [-0.06, 0.05])
+def test_the_way_that_it_travels_shows_a_camera_s_pitch(pitch_rad: float) -> None:
+    lens = calibrated(drive(-0.2, math.radians(40.0), images=40, pitch_rad=pitch_rad), 1.1 * FOCAL_PX)
+    assert lens.pitch is not None
+    assert abs(lens.pitch.pitch_rad - pitch_rad) < 3.0 * lens.pitch.sigma_rad
+    assert lens.pitch.sigma_rad < 0.015
 
 
 def test_what_is_known_beforehand_is_kept_where_the_drive_shows_no_more() -> None:

@@ -9,10 +9,9 @@ lens is common to all. The principal point is the image's centre, the pixels are
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,30 +26,15 @@ from birdslam.calibration.lens_adjustment import (
     shared_by,
     some_corners,
 )
-from birdslam.geometry.camera import Camera
+from birdslam.calibration.lens_windows import FOCAL_PX, CornersOfImage, Window, begin, windows_of
+from birdslam.calibration.travel import TravelPitch, pitch_by_travel
 from birdslam.geometry.pose import rotation_log
-from birdslam.odometry.corners.feature_tracks import FeatureConfig, FeatureTracker
-from birdslam.odometry.road.points import outside
-from birdslam.odometry.working_resolution import WorkingResolution
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-# So far _MOVED of the corners have moved from one image of a window to the next; of short drives less
-_STEPS_RAD = 0.016, 0.012
-_MOVED = 0.4
-_FIXED_RAD = 0.003  # a corner that moves by less over a window is far off, or on the windscreen or bonnet
-_MOST_WINDOWS = 40
-_LEAST_WINDOWS = 4
-_LEAST_CORNERS = 20  # of a window
-_MOST_CORNERS = 100
-_TWO_VIEW_PX = 1.5  # outliers' limit of the first poses, by pixels of a lens of _FOCAL_PX
-_FOCAL_PX = 720.0
-_SIGMA_PX = 0.5  # of a corner, by the same pixels
-_MOST_TURN_RAD = 0.8  # of a window
+_SIGMA_PX = 0.5  # of a corner, by pixels of a lens of FOCAL_PX
 _LEAST_TURN_RAD = math.radians(30.0)  # a drive that turns less shows no focal length: of 19 real ones eleven did not
-_FARTHEST = 80.0  # of a corner that begins the adjustment, in baselines of its window
-_WIDEST_RAD = 1.45  # from the axis, of a corner
 _BEGUN = -1.0, 0.0, 1.0  # where the focal length is looked for from, in sigmas of what is known of it
 _ROUGHLY = 1e-4  # how far each is adjusted
 _BLOCKS = 8  # of the windows, for the sigma
@@ -72,7 +56,7 @@ class Lens:
 
     `u` are normalised coordinates; a `fisheye` has the angle from its axis in place of |u|, in u's direction.
     `turned_rad` is how far the camera turned within the windows, all together; `focal_shown` whether the drive itself
-    says more of the focal length than was known before.
+    says more of the focal length than was known before; `pitch` is the camera's, by the way it travels.
     """
 
     focal_px: float
@@ -84,14 +68,7 @@ class Lens:
     turned_rad: float
     focal_shown: bool
     fisheye: bool = False
-
-
-@dataclass(frozen=True)
-class CornersOfImage:
-    """Followed corners of one raw image: ids (N,) ascending, px (N, 2)."""
-
-    ids: Ints
-    px: Floats
+    pitch: TravelPitch | None = None
 
 
 def focal_by_field_of_view(width_px: int, degrees: float, fisheye: bool = False) -> float:
@@ -104,29 +81,6 @@ def k1_by_bend(bend: tuple[float, float], focal: float) -> tuple[float, float]:
     """k1 and its 1-sigma by upright lines, and by what is known beforehand; the focal length in image widths."""
     by_lines, by_kind = (bend[1] * focal**2) ** -2.0, SIGMA_K1**-2.0
     return bend[0] * focal**2 * by_lines / (by_lines + by_kind), (by_lines + by_kind) ** -0.5
-
-
-def followed_corners(images: Iterable[tuple[NDArray[np.uint8], Floats]], camera: Camera) -> list[CornersOfImage]:
-    """Corners of a camera's raw images, followed from each to the next, outside the boxes (B, 4) of vehicles in each.
-
-    Of the camera only its size and about its focal length count.
-    """
-    out: list[CornersOfImage] = []
-    resolution = WorkingResolution(camera)
-    tracker = FeatureTracker(resolution.camera.width_px, resolution.camera.height_px, FeatureConfig())
-    for image, boxes_px in images:
-        tracks = tracker.track(resolution.image(image))
-        tracker.accept(tracks)
-        static = outside(tracks.px, resolution.boxes_px(boxes_px))
-        out.append(CornersOfImage(tracks.ids[static], resolution.given_px(tracks.px[static])))
-    return out
-
-
-@dataclass(frozen=True)
-class _Window:
-    """Corners that all images of one window show, px (IMAGES, N, 2)."""
-
-    px: Floats
 
 
 def self_calibrate(
@@ -149,16 +103,13 @@ def self_calibrate(
     if bend is not None and not fisheye:
         k1_before = k1_by_bend(bend, focal_px / size_px[0])
     middle = 0.5 * (np.array(size_px, dtype=np.float64) - 1.0)
-    windows: list[_Window] = []
-    for step_rad in _STEPS_RAD:
-        if len(windows) < 2 * _LEAST_WINDOWS:
-            windows = _windows(images, middle, step_rad * focal_px)
-    sigma_px = _SIGMA_PX * focal_px / _FOCAL_PX
-    begun = _begin(windows, focal_px, k1_before[0], sigma_px, fisheye, k1_before)
+    windows = windows_of(images, middle, focal_px)
+    sigma_px = _SIGMA_PX * focal_px / FOCAL_PX
+    begun = begin(windows, focal_px, k1_before[0], sigma_px, fisheye, k1_before)
     if begun is None:
         return None
     fitted = adjust(begun)
-    again = _begin(windows, focal_px, fitted.k1, sigma_px, fisheye, k1_before)
+    again = begin(windows, focal_px, fitted.k1, sigma_px, fisheye, k1_before)
     fitted = fitted if again is None else adjust(again)
     if by_view:
         half = 0.5 * size_px[0] / focal_px
@@ -171,16 +122,19 @@ def self_calibrate(
         sigmas_found = _sigmas(found, prior)
         shown = bool(max(sigmas_found[1], LEAST_SIGMA_REL) < _SHOWN * focal_sigma_rel)
         fitted, sigmas = (found, sigmas_found) if shown else (fitted, sigmas)
+    if shown:
+        focal_sigma_rel = max(float(sigmas[1]), LEAST_SIGMA_REL)
     return Lens(
         focal_px=math.exp(fitted.log_focal),
         k1=fitted.k1,
-        focal_sigma_rel=max(float(sigmas[1]), LEAST_SIGMA_REL) if shown else focal_sigma_rel,
+        focal_sigma_rel=focal_sigma_rel,
         k1_sigma=min(max(LEAST_SIGMA_K1, float(sigmas[0])), k1_before[1]),
         windows=len(fitted.R),
         corners=len(fitted.px),
         turned_rad=turned_rad,
         focal_shown=shown,
         fisheye=fisheye,
+        pitch=pitch_by_travel(fitted, focal_sigma_rel),
     )
 
 
@@ -189,13 +143,13 @@ def _turned_rad(problem: LensProblem) -> float:
     return sum(float(np.linalg.norm(rotation_log(R[IMAGES // 2]))) for R in problem.R)
 
 
-def _with_focal_length(windows: Sequence[_Window], fitted: LensProblem, prior: FocalPrior) -> LensProblem:
+def _with_focal_length(windows: Sequence[Window], fitted: LensProblem, prior: FocalPrior) -> LensProblem:
     """The problem with the focal length that costs least, of those that are found from several."""
     begun = (at_focal_length(fitted, prior.log_focal + by * prior.sigma) for by in _BEGUN)
     found = [adjust(problem, prior, _ROUGHLY) for problem in begun]
     best = min(found, key=lambda problem: cost_of(problem, prior))
     # Which corners are outliers was decided with another lens
-    again = _begin(windows, math.exp(best.log_focal), best.k1, best.sigma_px, best.fisheye, best.k1_before)
+    again = begin(windows, math.exp(best.log_focal), best.k1, best.sigma_px, best.fisheye, best.k1_before)
     return best if again is None else adjust(again, prior)
 
 
@@ -231,134 +185,3 @@ def _shared_without(problem: LensProblem, prior: FocalPrior, some: NDArray[np.bo
     """(k1, log of the focal length) by some of the corners (P,); by what is known beforehand where few are left."""
     left = some_corners(problem, some)
     return shared_by(left, prior)[0] if len(left.R) else np.array([0.0, prior.log_focal])
-
-
-# --- windows ---
-
-
-def _windows(images: Sequence[CornersOfImage], middle: Floats, step_px: float) -> list[_Window]:
-    """Windows of the drive, each of images between which corners have moved by a step."""
-    found, first = [], 0
-    while first < len(images) - IMAGES:
-        at = [first]
-        for k in range(first + 1, len(images)):
-            moved = _flow_px(images[at[-1]], images[k])
-            if len(moved) < _LEAST_CORNERS:
-                break
-            if np.quantile(moved, 1.0 - _MOVED) > step_px:
-                at.append(k)
-            if len(at) == IMAGES:
-                break
-        if len(at) < IMAGES:
-            first += 1
-            continue
-        window = _common(images, at, middle, step_px / _STEPS_RAD[0] * _FIXED_RAD)
-        if window is not None:
-            found.append(window)
-        first = at[IMAGES // 2]
-    keep = np.unique(np.linspace(0, len(found) - 1, min(len(found), _MOST_WINDOWS)).round().astype(int))
-    return [found[k] for k in keep]
-
-
-def _flow_px(a: CornersOfImage, b: CornersOfImage) -> Floats:
-    """(N,) how far the corners that both show have moved."""
-    _, in_a, in_b = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
-    out: Floats = np.linalg.norm(b.px[in_b] - a.px[in_a], axis=1)
-    return out
-
-
-def _common(images: Sequence[CornersOfImage], at: Sequence[int], middle: Floats, fixed_px: float) -> _Window | None:
-    ids = images[at[0]].ids
-    for k in at[1:]:
-        ids = np.intersect1d(ids, images[k].ids, assume_unique=True)
-    first, last = (images[k].px[np.searchsorted(images[k].ids, ids)] for k in (at[0], at[-1]))
-    ids = ids[np.linalg.norm(last - first, axis=1) > fixed_px]
-    if len(ids) < _LEAST_CORNERS:
-        return None
-    if len(ids) > _MOST_CORNERS:  # evenly over their ids, which are those of all parts of the image
-        ids = ids[np.linspace(0, len(ids) - 1, _MOST_CORNERS).astype(int)]
-    return _Window(np.array([images[k].px[np.searchsorted(images[k].ids, ids)] - middle for k in at]))
-
-
-def _undistorted(px: Floats, focal_px: float, k1: float, fisheye: bool) -> Floats:
-    """(..., 2) normalised coordinates of pixels from the middle, by fixed-point iteration."""
-    distorted = px / focal_px
-    radius = np.maximum(np.sqrt(np.square(distorted).sum(axis=-1, keepdims=True)), 1e-9)
-    found = radius
-    for _ in range(8):
-        found = radius / np.maximum(1.0 + k1 * np.square(found), 0.3)
-    out: Floats = distorted / radius * (np.tan(np.minimum(found, _WIDEST_RAD)) if fisheye else found)
-    return out
-
-
-def _begin(
-    windows: Sequence[_Window],
-    focal_px: float,
-    k1: float,
-    sigma_px: float,
-    fisheye: bool,
-    k1_before: tuple[float, float],
-) -> LensProblem | None:
-    """Poses and corners of each window, by its first and last image and by resection of those between."""
-    px, of, corner = [], [], []
-    R: list[Floats] = []
-    t: list[Floats] = []
-    for window in windows:
-        begun = _begin_window(_undistorted(window.px, focal_px, k1, fisheye))
-        if begun is None:
-            continue
-        keep, R_w, t_w, corner_w = begun
-        px.append(window.px[:, keep].transpose(1, 0, 2))
-        of.append(np.full(int(keep.sum()), len(R)))
-        R.append(R_w)
-        t.append(t_w)
-        corner.append(corner_w)
-    if len(R) < _LEAST_WINDOWS:
-        return None
-    return LensProblem(
-        np.concatenate(px),
-        np.concatenate(of),
-        np.array(R),
-        np.array(t),
-        np.concatenate(corner),
-        math.log(focal_px),
-        k1,
-        sigma_px,
-        fisheye,
-        k1_before,
-    )
-
-
-def _begin_window(xy: Floats) -> tuple[NDArray[np.bool_], Floats, Floats, Floats] | None:
-    """Which corners of (IMAGES, N, 2) normalised coordinates begin, poses of the images, and corners (N', 3)."""
-    cv2.setRNGSeed(1)
-    first, last = xy[0], xy[-1]
-    E, inliers = cv2.findEssentialMat(first, last, np.eye(3), cv2.USAC_MAGSAC, 0.999, _TWO_VIEW_PX / _FOCAL_PX, 500)
-    if E is None or E.shape != (3, 3) or inliers is None:
-        return None
-    _, R, t, _, _ = cv2.recoverPose(E, first, last, cameraMatrix=np.eye(3), distanceThresh=1e5, mask=inliers.copy())
-    turn: Floats = np.asarray(R, np.float64)
-    R, t = turn, np.asarray(t, np.float64).ravel()
-    if abs(t[2]) < 0.5 or np.linalg.norm(rotation_log(turn)) > _MOST_TURN_RAD:  # no car's
-        return None
-    P = np.hstack([R, t[:, None]])
-    X = cv2.triangulatePoints(np.eye(3, 4), P, first.T, last.T)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        X = (X[:3] / X[3]).T
-    ahead = (X[:, 2] > 0.1) & (X[:, 2] < _FARTHEST) & ((X @ R.T + t)[:, 2] > 0.1)
-    keep = np.asarray((inliers.ravel() > 0) & ahead & np.isfinite(X).all(axis=1))
-    if keep.sum() < _LEAST_CORNERS:
-        return None
-    poses_R, poses_t = [np.eye(3)], [np.zeros(3)]
-    for seen in xy[1:-1]:
-        found, turned, place, _ = cv2.solvePnPRansac(
-            X[keep], seen[keep], np.eye(3), np.zeros(4), reprojectionError=2.0 * _TWO_VIEW_PX / _FOCAL_PX,
-            iterationsCount=50,
-        )  # fmt: skip
-        if not found:
-            return None
-        poses_R.append(np.asarray(cv2.Rodrigues(turned)[0], np.float64))
-        poses_t.append(np.asarray(place, np.float64).ravel())
-    by_z = 1.0 / X[keep, 2]
-    corner = np.column_stack([X[keep, 0] * by_z, X[keep, 1] * by_z, by_z])
-    return keep, np.array([*poses_R, R]), np.array([*poses_t, t]), corner

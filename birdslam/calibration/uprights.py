@@ -22,6 +22,7 @@ from birdslam.calibration.lens import WIDE_DEG
 
 Floats = NDArray[np.float64]
 
+UPRIGHT_IMAGES = 30  # of a drive, in which upright lines are looked for
 _WIDTH_PX = 800  # of the image in which edges are looked for, at the most
 _LEAST_LENGTH, _MOST_LEAN = 0.03, 0.35  # of an edge: in widths, and its slope against the image's columns
 _LEAST_EDGES, _BLOCKS = 100, 6  # in all; of the drive, for the sigma

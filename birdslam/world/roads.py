@@ -1,4 +1,4 @@
-"""Roads that the odometry must master, each from its seed: bare motorways, ramps, a street and a motorway at night.
+"""Roads that odometry and lanes must master, each from its seed: motorways, ramps, nights, a town, an avenue, hills.
 
 Each is a scenario of its own: what lies beside a motorway is far, its asphalt smooth; a ramp begins in its bend.
 """
@@ -19,9 +19,10 @@ from birdslam.world.rendering.photometrics import Lens
 from birdslam.world.scenario import Scenario
 from birdslam.world.street.course import STEP_M, Course
 from birdslam.world.street.street import ASPHALT, BAND, CROSSING, GRASS, HATCHED, LINE, LINE_KINDS, MARK, Lane, Street
+from birdslam.world.street.street_plan import draw_street
 from birdslam.world.traffic.fleet import draw_shape, draw_truck
-from birdslam.world.traffic.flow import Mover
-from birdslam.world.traffic.placement import Standing, background, tree
+from birdslam.world.traffic.flow import Mover, populate, settle
+from birdslam.world.traffic.placement import Standing, background, furnish, tree
 from birdslam.world.traffic.poses import place
 
 # The field of view of KITTI's cameras, at a size that renders in a sixth of a second
@@ -122,6 +123,20 @@ def night_street(seed: int, speed_mps: float) -> Scenario:
     return Scenario(
         street, standing, (ahead, *coming), ego, even_sky(0.25), dark_camera(), seed, AXLE_M, Night()
     )  # fmt: skip
+
+
+def built_up(seed: int, kind: str, speed_mps: float, grade: float = 0.0) -> Scenario:
+    """A drawn street of a kind by day with all that stands and drives there, gently bent, up and down at `grade`."""
+    rng = np.random.default_rng([seed, 9])
+    length_m = EGO_M + 14.0 * speed_mps + _BEYOND_M
+    s = np.arange(int(length_m / STEP_M) + 1) * STEP_M
+    course = Course(0.003 * np.sin(2.0 * math.pi * s / 240.0), grade * np.sin(2.0 * math.pi * s / 180.0))
+    street = draw_street(rng, length_m, EGO_M, kind, course)
+    standing = place(street, furnish(rng, street, EGO_M - 12.0, length_m - 50.0))
+    lane = next(lane for lane in street.lanes if lane.direction > 0)
+    movers = tuple(settle(populate(rng, street, EGO_M, lane.d_m, 300.0), street))
+    ego = Mover(draw_shape(rng, "estate"), EGO_M, lane.d_m, 0.0, speed_mps, speed_mps, lane.d_m)
+    return Scenario(street, standing, movers, ego, _sunny(), _camera(), seed, AXLE_M)
 
 
 def _road(course: Course, forth: int, back: int, surface: _Surface) -> Street:
@@ -253,4 +268,7 @@ ROADS: dict[str, Road] = {
         "a motorway in own headlights, 27 m/s",
         lambda: motorway(10, 27.0, 0.0, _Surface(0.8), night=Night()), 20.0,
     ),
+    "town": Road("a street of a town with parked cars, 10 m/s", lambda: built_up(11, "urban", 10.0), 10.0),
+    "avenue": Road("an avenue of a town, 13 m/s", lambda: built_up(12, "avenue", 13.0), 10.0),
+    "hills": Road("a country road up and down at 6 %, 16 m/s", lambda: built_up(13, "country", 16.0, 0.06), 10.0),
 }  # fmt: skip

@@ -21,8 +21,9 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from birdslam.calibration.lens import CornersOfImage, followed_corners, self_calibrate
-from birdslam.calibration.uprights import lens_by_uprights, upright_edges
+from birdslam.calibration.lens import self_calibrate
+from birdslam.calibration.lens_windows import CornersOfImage, followed_corners
+from birdslam.calibration.uprights import UPRIGHT_IMAGES, lens_by_uprights, upright_edges
 from birdslam.geometry.camera import Camera, Undistorter
 from birdslam.odometry.odometry import Odometry
 from birdslam.perf.accuracy.drives import is_valid, networks_of
@@ -46,7 +47,6 @@ PRIORS = 1.15, 1.0 / 1.15
 PRIOR_SIGMA = 0.15
 METRES_S = 6.0  # of a drive, whose way is compared
 NO_BOXES = np.zeros((0, 4))
-UPRIGHT_IMAGES = 30  # of a drive, in which upright lines are looked for
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,8 @@ from birdslam.bench.tracking.localisation import CAMERA_OF_BOXES
 from birdslam.bench.tracking.metrics import path_errors
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
+from birdslam.graph.factors.factor import Factor
+from birdslam.graph.factors.standard import standard_factors
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.paper import NO_GATE
 from birdslam.perception import Pending, Perception, Ready
@@ -65,10 +67,12 @@ Change = Callable[[Measurements], Measurements]
 
 @dataclass(frozen=True)
 class Variant:
-    """The default but for a change of the graph, or of each record."""
+    """The default but for a change of the graph, or of each record, or with factors of one's own and their records."""
 
     live: Live
     change: Change = lambda m: m
+    factors: Callable[[], Sequence[Factor]] = tuple
+    records: Callable[[Measurements], Sequence[object]] = lambda m: ()
 
 
 def variants() -> dict[str, Variant]:
@@ -153,17 +157,7 @@ class Case:
 def recorded(name: str, data: Path, logs: Path, configuration: Configuration) -> Case:
     """A clip's log of its images: the one in `logs`, or recorded anew and put there."""
     folder, left_out = CLIPS[name]
-    path = logs / f"{name}.log"
-    if not path.exists():
-        source = configuration.source
-        with pipeline(configuration) as drive:
-            recording = open_recorded(
-                recording_uri(str(data / folder)), configuration.camera, source.stride, source.topics
-            )
-            log = [record for record in drive(recording) if isinstance(record, Measurements)]
-        logs.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(msgspec.msgpack.encode(log, enc_hook=_plain))
-    log = msgspec.msgpack.decode(path.read_bytes(), type=list[Measurements])[left_out:]
+    log = log_of(str(data / folder), logs / f"{name}.log", configuration)[left_out:]
     if folder.startswith(TRACKING):
         truth = Truth.of(open_tracking(data / TRACKING, name), log)
         return Case(name, log, truth.ego, truth, AXES_SIGMA_RAD)
@@ -175,6 +169,18 @@ def recorded(name: str, data: Path, logs: Path, configuration: Configuration) ->
     first = inverse(camera[log[0].frame_id])
     ego = {m.frame_id: split_pose(mount @ first @ camera[m.frame_id] @ inverse(mount))[0] for m in log}
     return Case(name, log, ego, None, AXES_SIGMA_RAD)
+
+
+def log_of(drive: str, path: Path, configuration: Configuration) -> list[Measurements]:
+    """A drive's log: the one at `path`, or recorded anew and put there."""
+    if not path.exists():
+        source = configuration.source
+        with pipeline(configuration) as run_through:
+            recording = open_recorded(recording_uri(drive), configuration.camera, source.stride, source.topics)
+            log = [record for record in run_through(recording) if isinstance(record, Measurements)]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(msgspec.msgpack.encode(log, enc_hook=_plain))
+    return msgspec.msgpack.decode(path.read_bytes(), type=list[Measurements])
 
 
 def _plain(value: object) -> object:
@@ -205,12 +211,13 @@ def simulated(name: str, data: Path, seed: int) -> Case:
 
 def grade(variant: Variant, case: Case) -> dict[str, float]:
     """ATE of ego and cars (mean, live and final; each car's as "live 31") and NEES of both."""
-    graph, live = PoseGraph(variant.live.graph, variant.live.weights), LiveTrajectories()
+    settings = variant.live.graph, variant.live.weights
+    graph, live = PoseGraph(*settings, factors=[*standard_factors(*settings), *variant.factors()]), LiveTrajectories()
     smoother = RtsSmoother(SmootherConfig())
     of_ego, of_ego_beside_axes, of_cars = [], [], []
     for record in case.log:
         m = variant.change(record)
-        estimate = graph.optimise(m)
+        estimate = graph.optimise(m, variant.records(m))
         live.add(estimate)
         smoother.add(m, estimate)
         error = estimate.T_world_ego.between(case.ego[m.frame_id]).log()

@@ -24,6 +24,7 @@ from typing import Any
 from birdslam.bench.tracking.by_class import people_page
 from birdslam.perf.__main__ import benchmark_modules
 from birdslam.perf.accuracy import films, overlays, tilt
+from birdslam.perf.browser import gallery
 from birdslam.perf.cameras import lens
 from birdslam.perf.errors import PerfError
 from birdslam.perf.graph import agents, edges, edges_table
@@ -224,6 +225,12 @@ PAGES: tuple[Derived | Page, ...] = (
         {"docs/foxglove.jpg": ("foxglove.jpg", None)},
         (foxglove.run,),  # it shows the layout; what was driven is shown elsewhere
         (str(foxglove.LAYOUT),),
+    ),
+    Page(
+        "gallery",
+        ("python -m birdslam.perf gallery --output {out}",),
+        {f"docs/gallery/{name}.jpg": (f"{name}.jpg", None) for name in gallery.PICTURES},
+        (gallery.run,),  # it shows what a run leaves; what was driven is shown elsewhere
     ),
     Page(
         "faults",

@@ -11,6 +11,7 @@ import msgspec
 
 from birdslam.calibration.calibration import Calibration, CalibrationConfig, CalibrationError, calibrate
 from birdslam.calibration.intrinsics import Intrinsics
+from birdslam.calibration.travel import TravelPitch
 from birdslam.frontend import Pending
 from birdslam.geometry.camera import Camera
 from birdslam.outputs.plain_words import LengthsBy
@@ -58,11 +59,14 @@ def calibrate_drive(
     lens, height_m = lens_of(given, uri, topics)
     size = frame_size(uri, topics)
     is_film = parsed(uri)[0].camera in ("frame size", "nothing")
+    pitch: TravelPitch | None = None
     if lens is None and size is not None and is_film:
-        lens = lens_of_drive(configuration, uri, given, size, stride, must_show)
+        lens, pitch = lens_of_drive(configuration, uri, given, size, stride, must_show)
     if lens is not None and size is not None:
         lens = lens.for_size(*size)
     recording = _open(uri, lens, height_m, stride, topics)
+    if pitch is not None:
+        recording.camera = msgspec.structs.replace(recording.camera, pitch_rad=pitch.pitch_rad)
     known_height = height_m is not None or lens is None  # a recording with a calibration of its own says the height
     cv2.setNumThreads(configuration.perceive.opencv_threads)
     configuration = configuration.as_lossless()
@@ -81,25 +85,26 @@ def calibrate_drive(
         except CalibrationError as error:
             if must_show:
                 raise CalibrationError(f"{uri}: {error}") from None
-            found = _level(recording.camera, str(error))
+            found = _assumed(recording.camera, pitch, str(error))
     camera, height_by = with_height(found, known_height, lens, uri, is_film)
     return Calibrated(camera, [*report(found, camera, height_by, uri, lens)], lengths_by(camera, height_by, lens))
 
 
-def _level(camera: Camera, why: str) -> Calibration:
-    """A camera that looks level, since the drive does not show how it is mounted."""
-    camera = msgspec.structs.replace(camera, pitch_rad=0.0, roll_rad=0.0, tilt_sigma_rad=LEVEL_SIGMA_RAD)
-    var = LEVEL_SIGMA_RAD**2
+def _assumed(camera: Camera, pitch: TravelPitch | None, why: str) -> Calibration:
+    """A camera that looks level, but for the pitch that its way shows: the road does not show how it is mounted."""
+    level = TravelPitch(0.0, LEVEL_SIGMA_RAD)
+    pitch_rad, sigma_rad = pitch or level
+    camera = msgspec.structs.replace(camera, pitch_rad=pitch_rad, roll_rad=0.0, tilt_sigma_rad=LEVEL_SIGMA_RAD)
     return Calibration(
         camera=camera,
-        cov=(var, 0.0, 0.0, var),
+        cov=(sigma_rad**2, 0.0, 0.0, LEVEL_SIGMA_RAD**2),
         estimates=(),
         height_checks=(),
         yaw_rad=None,
         path_m=0.0,
         frames=0,
         speed_mps=0.0,
-        assumed=why,
+        assumed=f"its pitch by the way it travels, no roll: {why}" if pitch else f"that it looks level: {why}",
     )
 
 

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import islice
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.calibration.calibration import CalibrationError
 from birdslam.calibration.intrinsics import Intrinsics
-from birdslam.calibration.lens import WIDE_SIGMA_REL, followed_corners, k1_by_bend, self_calibrate
+from birdslam.calibration.lens import WIDE_SIGMA_REL, k1_by_bend, self_calibrate
 from birdslam.calibration.lens_adjustment import IMAGES
-from birdslam.calibration.uprights import LensByUprights, lens_by_uprights, upright_edges
+from birdslam.calibration.lens_windows import followed_corners
+from birdslam.calibration.travel import TravelPitch
+from birdslam.calibration.uprights import UPRIGHT_IMAGES, LensByUprights, lens_by_uprights, upright_edges
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.runtime.calibration.given import FocalLength, Given, focal_length_of
@@ -23,12 +26,18 @@ from birdslam.runtime.nodes.sources import RecordedSource, offline_frames, open_
 from birdslam.runtime.progress import with_progress
 
 _LENS_S = 120.0  # of a film, from which its lens is found
-_UPRIGHT_IMAGES = 30  # of these, in which upright lines are looked for
+
+
+class LensOfDrive(NamedTuple):
+    """A lens, and the camera's pitch by the way it travels, where its corners show it."""
+
+    lens: Intrinsics
+    pitch: TravelPitch | None = None
 
 
 def lens_of_drive(
     configuration: Configuration, uri: str, given: Given, size_px: tuple[int, int], stride: int, must_show: bool = True
-) -> Intrinsics:
+) -> LensOfDrive:
     """The lens of a film that says nothing of its camera, by what its images show.
 
     Raises CalibrationError where they do not show it; without `must_show` it is then what is known beforehand.
@@ -41,7 +50,7 @@ def lens_of_drive(
     recording = open_recorded(uri, camera, stride, configuration.source.topics)
     configuration = configuration.as_lossless()
     frames = max(1, round(_LENS_S * recording.rate_hz))
-    every = max(1, min(frames, len(recording) or frames) // _UPRIGHT_IMAGES)
+    every = max(1, min(frames, len(recording) or frames) // UPRIGHT_IMAGES)
     edges: list[Floats] = []
     with Inference(complete(configuration, camera, recording.rate_hz)) as inference:
 
@@ -65,7 +74,7 @@ def lens_of_drive(
         shape = (
             "equidistant" if known.fisheye else "no distortion" if bend is None else f"k1 {k1:+.3f} by upright lines"
         )
-        return Intrinsics(
+        assumed = Intrinsics(
             fx_px=focal_px,
             fy_px=focal_px,
             cx_px=middle[0],
@@ -78,6 +87,7 @@ def lens_of_drive(
             f"{by}; {shape}",
             sigma_focal_px=focal_px * sigma_rel,
         )
+        return LensOfDrive(assumed)
     if lens is None:
         raise CalibrationError(
             f"{uri}: its images do not show its lens: the car hardly drives in its first {_LENS_S:g} s, or little is "
@@ -86,7 +96,7 @@ def lens_of_drive(
     focal = f"focal length {lens.focal_px:.0f} px +- {lens.focal_sigma_rel:.0%}"
     lines = f", {uprights.edges} upright lines" if bend is not None and uprights is not None else ""
     shown = "by the drive" if lens.focal_shown else f"{by}; the drive turns too little to show it"
-    return Intrinsics(
+    found = Intrinsics(
         fx_px=lens.focal_px,
         fy_px=lens.focal_px,
         cx_px=middle[0],
@@ -101,6 +111,7 @@ def lens_of_drive(
         ),
         sigma_focal_px=lens.focal_px * lens.focal_sigma_rel,
     )
+    return LensOfDrive(found, lens.pitch)
 
 
 def with_uprights(known: FocalLength, uprights: LensByUprights | None, width_px: int) -> FocalLength:

@@ -17,7 +17,7 @@ from birdslam.sources.camera_file import camera_text
 
 def report(found: Calibration, camera: Camera, height_by: HeightBy, uri: str, lens: Intrinsics | None) -> Iterator[str]:
     if found.assumed:
-        yield f"from {uri}: assumed to look level, since the drive does not show its tilt: {found.assumed}"
+        yield f"from {uri}: the road does not show the tilt; assumed {found.assumed}"
     else:
         yield f"from {uri}: {found.frames} frames, {found.path_m:.0f} m"
     source = "the recording" if lens is None else lens.source

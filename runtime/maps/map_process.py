@@ -32,6 +32,7 @@ from birdslam.runtime.environment import USER_ERROR_STATUS
 from birdslam.runtime.maps.drive_earth import write_earth
 from birdslam.runtime.maps.gnss_input import Fixes, Receiver, is_serial, recorded_fixes
 from birdslam.runtime.maps.map_drive import MapChoice, MapDrive
+from birdslam.runtime.process import realtime
 from birdslam.runtime.process.beside import DISK_STATUS, Stop, run_beside
 from birdslam.runtime.process.restarts import Assignment
 from birdslam.runtime.process.vitals import Vitals
@@ -46,6 +47,7 @@ TURN_S = 0.05  # what has come is taken up at least so often
 END_S = 2.0  # after SIGTERM, for the end of the source to come through
 HEALTH_NS = 1_000_000_000
 WAITING_ESTIMATES = 1024  # while a loop is closed
+HELD_MIB = 8.0, 20.0  # of small objects and of others: WAITING_ESTIMATES as bytes, 10 kB each, and what a look needs
 WAITING_IMAGES = 4  # of frames whose estimates have not come yet: the oldest, however late estimates are
 CPU_SHARE = 0.5  # of one core, that looking at images may take in the long run; odometry carries the frames between
 SAVE_EVERY_S, SAVE_SHARE = 10.0, 0.02  # and a large map so seldom that writing it takes no more of the time
@@ -268,6 +270,8 @@ def localise(configuration: Configuration, assignment: Assignment, vitals: Vital
         except (MapError, GnssError, ConfigurationError) as error:
             log.error("%s", error)
             return USER_ERROR_STATUS
+        realtime.reserve(*HELD_MIB)
+        realtime.freeze_objects()
         vitals.beat()
         vitals.count(ready=1)
         bus.declare_alive()

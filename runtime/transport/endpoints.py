@@ -16,6 +16,8 @@ from birdslam.runtime.topology import Topic
 from birdslam.runtime.transport.queries import RetainedMessages
 from birdslam.runtime.wire import MAX_TRACE_BYTES, Stage, Trace, WireError, decode, encode
 
+UNPACKED = 16  # messages that wait as records; an estimate is 29 kB of memory so, and 2 to 12 as bytes
+
 log = logging.getLogger(__name__)
 
 _Attached = TypeVar("_Attached", bound=msgspec.Struct)
@@ -38,6 +40,15 @@ class Message:
     """A record of the topic's type, where its time went, and when it came in (CLOCK_MONOTONIC)."""
 
     record: Any
+    trace: Trace
+    t_received_ns: int
+
+
+@dataclass(frozen=True)
+class _Packed:
+    """A message that waits behind many others: valid, and as it was sent."""
+
+    payload: bytes
     trace: Trace
     t_received_ns: int
 
@@ -135,12 +146,13 @@ class Subscriber:
 
     `newest` is the last message that came in, whether it was read or not. `dropped` counts the messages that were lost
     on the way here (its sender numbers them) and those that a newer one pushed out of the full queue, `malformed` those
-    that were no valid record, or were sent to more keys than this: on the lossy bus they may count as lost too.
+    that were no valid record, or were sent to more keys than this: on the lossy bus they may count as lost too. Behind
+    UNPACKED messages others wait as bytes, so that a reader that was held up has not grown by it.
     """
 
     def __init__(self, session: zenoh.Session, key: str, topic: Topic, depth: int, lossless: bool) -> None:
         self._topic, self._key, self._lossless = topic, key, lossless
-        self._queue: deque[Message] = deque(maxlen=depth)
+        self._queue: deque[Message | _Packed] = deque(maxlen=depth)
         self._arrived = threading.Condition()
         self._closed = False
         self.newest: Message | None = None
@@ -162,7 +174,10 @@ class Subscriber:
             self.dropped += _lost_between(self.newest, message)
             self.dropped += len(self._queue) == self._queue.maxlen
             self.newest = message
-            self._queue.append(message)
+            if len(self._queue) < UNPACKED:
+                self._queue.append(message)
+            else:
+                self._queue.append(_Packed(bytes(sample.payload), message.trace, message.t_received_ns))
             self._arrived.notify()
 
     def _receive_retained(self, reply: zenoh.Reply) -> None:
@@ -182,7 +197,10 @@ class Subscriber:
             if self._lossless and self.dropped:
                 name, depth = self._topic.name, self._queue.maxlen
                 raise MessagesLost(f"{name}: {self.dropped} messages lost behind {depth} unread ones, or on the way")
-            return self._queue.popleft() if self._queue else None
+            first = self._queue.popleft() if self._queue else None
+        if isinstance(first, _Packed):
+            return Message(decode(first.payload, self._topic.record), first.trace, first.t_received_ns)
+        return first
 
     def close(self) -> None:
         """Ends the subscription; a waiting recv raises BusClosed. A second call does nothing."""

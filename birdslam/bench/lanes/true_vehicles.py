@@ -50,7 +50,7 @@ class VehicleScores:
         poses = {v.vehicle: T_ego_world @ v.T_world_vehicle for v in estimate.vehicles}
         body_of: dict[int, TrueBody] = {}
         for place in lanes.vehicles:
-            body = _nearest(poses[place.vehicle], bodies)
+            body = _nearest(poses[place.vehicle], bodies) if place.vehicle in poses else None  # people have lanes, too
             if body is None:
                 continue
             body_of[place.vehicle] = body
@@ -107,7 +107,8 @@ def true_place(body: TrueBody, truth: tuple[TrueLine, ...]) -> str | None:
     painted = [at for t in truth if t.kind != KERB and (at := y_at(t, x)) is not None]
     if bounds is None or len(here) < 2 or not painted:
         return None
-    if not min(painted) < y < max(painted):
+    bounds_of_road = painted if len(painted) > 1 else here  # a street with a middle line ends at its kerbs
+    if not min(bounds_of_road) < y < max(bounds_of_road):
         return "off_road"
     if bounds[1] < y < bounds[0]:
         return "ego_lane"

@@ -1,0 +1,204 @@
+"""Windows of a drive that show its lens: images between which corners have moved, and where their adjustment begins."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.calibration.lens_adjustment import IMAGES, LensProblem
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.pose import rotation_log
+from birdslam.odometry.corners.feature_tracks import FeatureConfig, FeatureTracker
+from birdslam.odometry.road.points import outside
+from birdslam.odometry.working_resolution import WorkingResolution
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+# So far this share of the corners has moved from one image of a window to the next; of short drives less, and of lenses
+# that see so far across that near corners are soon gone
+_MOVED, _MOVED_WIDE = 0.4, 0.15
+_STEPS_RAD = (0.016, _MOVED), (0.012, _MOVED), (0.012, _MOVED_WIDE)
+_FIXED_RAD = 0.003  # a corner that moves by less over a window is far off, or on the windscreen or bonnet
+_MOST_WINDOWS = 40
+_LEAST_WINDOWS = 4
+_LEAST_CORNERS = 20  # of a window
+_MOST_CORNERS = 100
+_TWO_VIEW_PX = 1.5  # outliers' limit of the first poses, by pixels of a lens of FOCAL_PX
+FOCAL_PX = 720.0
+_MOST_TURN_RAD = 0.8  # of a window
+_FARTHEST = 80.0  # of a corner that begins the adjustment, in baselines of its window
+_WIDEST_RAD = 1.45  # from the axis, of a corner
+
+
+@dataclass(frozen=True)
+class CornersOfImage:
+    """Followed corners of one raw image: ids (N,) ascending, px (N, 2)."""
+
+    ids: Ints
+    px: Floats
+
+
+def followed_corners(images: Iterable[tuple[NDArray[np.uint8], Floats]], camera: Camera) -> list[CornersOfImage]:
+    """Corners of a camera's raw images, followed from each to the next, outside the boxes (B, 4) of vehicles in each.
+
+    Of the camera only its size and about its focal length count.
+    """
+    out: list[CornersOfImage] = []
+    resolution = WorkingResolution(camera)
+    tracker = FeatureTracker(resolution.camera.width_px, resolution.camera.height_px, FeatureConfig())
+    for image, boxes_px in images:
+        tracks = tracker.track(resolution.image(image))
+        tracker.accept(tracks)
+        static = outside(tracks.px, resolution.boxes_px(boxes_px))
+        out.append(CornersOfImage(tracks.ids[static], resolution.given_px(tracks.px[static])))
+    return out
+
+
+@dataclass(frozen=True)
+class Window:
+    """Corners that all images of one window show, px (IMAGES, N, 2)."""
+
+    px: Floats
+
+
+def windows_of(images: Sequence[CornersOfImage], middle: Floats, focal_px: float) -> list[Window]:
+    """Windows of a drive; `middle` (2,) is that of its images, the focal length about right."""
+    windows: list[Window] = []
+    for step_rad, share in _STEPS_RAD:
+        if len(windows) < 2 * _LEAST_WINDOWS:
+            windows = _apart(images, middle, step_rad * focal_px, share)
+    return windows
+
+
+def _apart(images: Sequence[CornersOfImage], middle: Floats, step_px: float, share: float) -> list[Window]:
+    """Windows of the drive, each of images between which a share of the corners has moved by a step."""
+    found, first = [], 0
+    while first < len(images) - IMAGES:
+        at = [first]
+        for k in range(first + 1, len(images)):
+            moved = _flow_px(images[at[-1]], images[k])
+            if len(moved) < _LEAST_CORNERS:
+                break
+            if np.quantile(moved, 1.0 - share) > step_px:
+                at.append(k)
+            if len(at) == IMAGES:
+                break
+        if len(at) < IMAGES:
+            first += 1
+            continue
+        window = _common(images, at, middle, step_px / _STEPS_RAD[0][0] * _FIXED_RAD)
+        if window is not None:
+            found.append(window)
+        first = at[IMAGES // 2]
+    keep = np.unique(np.linspace(0, len(found) - 1, min(len(found), _MOST_WINDOWS)).round().astype(int))
+    return [found[k] for k in keep]
+
+
+def _flow_px(a: CornersOfImage, b: CornersOfImage) -> Floats:
+    """(N,) how far the corners that both show have moved."""
+    _, in_a, in_b = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
+    out: Floats = np.linalg.norm(b.px[in_b] - a.px[in_a], axis=1)
+    return out
+
+
+def _common(images: Sequence[CornersOfImage], at: Sequence[int], middle: Floats, fixed_px: float) -> Window | None:
+    ids = images[at[0]].ids
+    for k in at[1:]:
+        ids = np.intersect1d(ids, images[k].ids, assume_unique=True)
+    first, last = (images[k].px[np.searchsorted(images[k].ids, ids)] for k in (at[0], at[-1]))
+    ids = ids[np.linalg.norm(last - first, axis=1) > fixed_px]
+    if len(ids) < _LEAST_CORNERS:
+        return None
+    if len(ids) > _MOST_CORNERS:  # evenly over their ids, which are those of all parts of the image
+        ids = ids[np.linspace(0, len(ids) - 1, _MOST_CORNERS).astype(int)]
+    return Window(np.array([images[k].px[np.searchsorted(images[k].ids, ids)] - middle for k in at]))
+
+
+def _undistorted(px: Floats, focal_px: float, k1: float, fisheye: bool) -> Floats:
+    """(..., 2) normalised coordinates of pixels from the middle, by fixed-point iteration."""
+    distorted = px / focal_px
+    radius = np.maximum(np.sqrt(np.square(distorted).sum(axis=-1, keepdims=True)), 1e-9)
+    found = radius
+    for _ in range(8):
+        found = radius / np.maximum(1.0 + k1 * np.square(found), 0.3)
+    out: Floats = distorted / radius * (np.tan(np.minimum(found, _WIDEST_RAD)) if fisheye else found)
+    return out
+
+
+def begin(
+    windows: Sequence[Window],
+    focal_px: float,
+    k1: float,
+    sigma_px: float,
+    fisheye: bool,
+    k1_before: tuple[float, float],
+) -> LensProblem | None:
+    """Poses and corners of each window, by its first and last image and by resection of those between."""
+    px, of, corner = [], [], []
+    R: list[Floats] = []
+    t: list[Floats] = []
+    for window in windows:
+        begun = _begin_window(_undistorted(window.px, focal_px, k1, fisheye))
+        if begun is None:
+            continue
+        keep, R_w, t_w, corner_w = begun
+        px.append(window.px[:, keep].transpose(1, 0, 2))
+        of.append(np.full(int(keep.sum()), len(R)))
+        R.append(R_w)
+        t.append(t_w)
+        corner.append(corner_w)
+    if len(R) < _LEAST_WINDOWS:
+        return None
+    return LensProblem(
+        np.concatenate(px),
+        np.concatenate(of),
+        np.array(R),
+        np.array(t),
+        np.concatenate(corner),
+        math.log(focal_px),
+        k1,
+        sigma_px,
+        fisheye,
+        k1_before,
+    )
+
+
+def _begin_window(xy: Floats) -> tuple[NDArray[np.bool_], Floats, Floats, Floats] | None:
+    """Which corners of (IMAGES, N, 2) normalised coordinates begin, poses of the images, and corners (N', 3)."""
+    cv2.setRNGSeed(1)
+    first, last = xy[0], xy[-1]
+    E, inliers = cv2.findEssentialMat(first, last, np.eye(3), cv2.USAC_MAGSAC, 0.999, _TWO_VIEW_PX / FOCAL_PX, 500)
+    if E is None or E.shape != (3, 3) or inliers is None:
+        return None
+    _, R, t, _, _ = cv2.recoverPose(E, first, last, cameraMatrix=np.eye(3), distanceThresh=1e5, mask=inliers.copy())
+    turn: Floats = np.asarray(R, np.float64)
+    R, t = turn, np.asarray(t, np.float64).ravel()
+    if abs(t[2]) < 0.5 or np.linalg.norm(rotation_log(turn)) > _MOST_TURN_RAD:  # no car's
+        return None
+    P = np.hstack([R, t[:, None]])
+    X = cv2.triangulatePoints(np.eye(3, 4), P, first.T, last.T)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        X = (X[:3] / X[3]).T
+    ahead = (X[:, 2] > 0.1) & (X[:, 2] < _FARTHEST) & ((X @ R.T + t)[:, 2] > 0.1)
+    keep = np.asarray((inliers.ravel() > 0) & ahead & np.isfinite(X).all(axis=1))
+    if keep.sum() < _LEAST_CORNERS:
+        return None
+    poses_R, poses_t = [np.eye(3)], [np.zeros(3)]
+    for seen in xy[1:-1]:
+        found, turned, place, _ = cv2.solvePnPRansac(
+            X[keep], seen[keep], np.eye(3), np.zeros(4), reprojectionError=2.0 * _TWO_VIEW_PX / FOCAL_PX,
+            iterationsCount=50,
+        )  # fmt: skip
+        if not found:
+            return None
+        poses_R.append(np.asarray(cv2.Rodrigues(turned)[0], np.float64))
+        poses_t.append(np.asarray(place, np.float64).ravel())
+    by_z = 1.0 / X[keep, 2]
+    corner = np.column_stack([X[keep, 0] * by_z, X[keep, 1] * by_z, by_z])
+    return keep, np.array([*poses_R, R]), np.array([*poses_t, t]), corner
