@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 
+from birdslam.geometry.arrays import Floats
 from birdslam.perf.latency.live import Ask, Run, drive
-from birdslam.perf.latency.system import WARM_UP_S, age_of, gone, split
 from birdslam.perf.reporting.figures import Ledger, spread
+from birdslam.runtime.transport.bus import Message
+
+Split = Callable[[Sequence[Message]], dict[str, Floats]]
 
 OPTIMIZER = "optimize"
 COMPARED = ("age", "p50"), ("age", "p99"), ("optimize", "p50"), ("optimize", "p99")
 
 
-def measure(ledger: Ledger, ask: Ask, pairs: int) -> None:
-    """So many runs of each, the order turned from pair to pair; then the median of with over without."""
+def measure(ledger: Ledger, ask: Ask, pairs: int, split: Split, warm_up_s: float) -> None:
+    """So many runs of each, the order turned from pair to pair; then the median of with over without.
+
+    `split`: milliseconds of each part of the messages' ages.
+    """
     rows: list[dict[str, dict[str, Any]]] = []
     with tempfile.TemporaryDirectory(prefix="perf-map") as folder:
         kept = f"results.map={Path(folder) / 'street.map'}"
@@ -27,7 +34,7 @@ def measure(ledger: Ledger, ask: Ask, pairs: int) -> None:
             for name in ("without", "with") if pair % 2 == 0 else ("with", "without"):
                 settings = (*ask.settings, kept) if name == "with" else ask.settings
                 with drive(msgspec.structs.replace(ask, settings=settings)) as run:
-                    row = rows[-1][name] = _figures(run)
+                    row = rows[-1][name] = _figures(run.after(warm_up_s), split)
                 age, optimize = row["age_ms"], row["optimize_ms"]
                 looked = f", {row['looks']} images looked at" if name == "with" else ""
                 text = (
@@ -45,13 +52,12 @@ def measure(ledger: Ledger, ask: Ask, pairs: int) -> None:
     ledger.add("with over without, median (each pair)", text, over=over)
 
 
-def _figures(run: Run) -> dict[str, Any]:
-    summary = run.summary
-    run.after(WARM_UP_S)
-    stages = split(run.messages)
+def _figures(run: Run, split: Split) -> dict[str, Any]:
+    summary, parts = run.summary, split(run.messages)
+    age_ms = [(message.t_received_ns - message.record.t_capture_ns) / 1e6 for message in run.messages]
     return {
-        "age_ms": spread([age_of(message) for message in run.messages]),
-        "optimize_ms": spread(gone(stages[OPTIMIZER])),
+        "age_ms": spread(age_ms),
+        "optimize_ms": spread(parts[OPTIMIZER][~np.isnan(parts[OPTIMIZER])]),
         "dropped": summary["frames_dropped"],
         "looks": summary["map"]["looks"] if "map" in summary else 0,
     }

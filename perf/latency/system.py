@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 
 from birdslam.geometry.arrays import Floats
-from birdslam.perf.latency import convoy
+from birdslam.perf.latency import beside_map, convoy
 from birdslam.perf.latency.live import Ask, Run, add_run_options, drive
 from birdslam.perf.reporting.arguments import benchmark_parser, numbers
 from birdslam.perf.reporting.figures import BLOCKS, Ledger, curve, noise, spread, spread_text
@@ -63,10 +63,8 @@ def run(arguments: list[str]) -> int:
     )
     settings = {**msgspec.to_builtins(ask, enc_hook=str), "seconds": options.seconds, "load": options.load}
     if options.map:
-        from birdslam.perf.latency import beside_map  # here: it takes this module's figures
-
         with Ledger(options.output, label, **settings) as ledger, busy_cores(options.load):
-            beside_map.measure(ledger, ask, options.map)
+            beside_map.measure(ledger, ask, options.map, split, WARM_UP_S)
         return 0
     with Ledger(options.output, label, **settings) as ledger:
         steal = Steal()

@@ -1,12 +1,10 @@
 """The same road twice: recall and false loops of places, errors of localisation, what closing a loop brings.
 
-    python -m perf loops [--output FILE.json] [--part recorded|town|loop|alike|scale|gnss|size ...]
-    python -m perf loops --run DIR [DIR ...]    # what `birdslam run --gnss FILE --output DIR` left
+    python -m perf loops [--output FILE.json] [--part recorded|town|loop|alike|scale|gnss|size ...] [--run DIR ...]
 
-`recorded`: two passes of one KITTI street in each other's map, three other streets against both. `town`: rendered once
-into --drives (extra `train`), driven twice, then otherwise. `loop`: corners without images, twice. `alike`: equal
-houses: each loop is false. `scale`: a unit of length that drifts. `gnss`: fixes that jump. `size`: simulated
-descriptors of 1, 10, 100 km.
+`recorded`: two passes of a KITTI street in each other's map, other streets in both. `town`: rendered into --drives,
+driven twice, then otherwise. `loop`, `alike`: corners without images, equal houses. `scale`: a unit of length that
+drifts. `gnss`: fixes that jump. `size`: simulated descriptors. `--run`: what `birdslam run --gnss` left in DIR.
 """
 
 from __future__ import annotations
