@@ -214,7 +214,7 @@ GROUPS = (
             "runtime.restart_window_s": "Within which time do these restarts count?",
             "runtime.spares": "Does a process of each node stand by for that, loaded and warm?",
             "realtime.fifo": 'Do nodes go before all else (SCHED_FIFO)? "auto": all of them with a live camera, else '
-            "capture, optimize and the frames of perceive",
+            "capture and optimize, and perceive's frames before its networks",
             "realtime.lock_memory": 'Does their memory stay in RAM? "auto": with a live camera',
             "realtime.NODE.priority": "Which priority has a node, under SCHED_FIFO?",
             "realtime.NODE.cpus": "On which cores may it run? none: all",

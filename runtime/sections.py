@@ -292,7 +292,7 @@ class NodeScheduling(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 class RealtimeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The scheduling of the nodes, where the system permits it (process/realtime.py); a line in the log where not."""
 
-    # SCHED_FIFO; "auto": all nodes with a live camera, else capture, optimize and of perceive what is not a network
+    # SCHED_FIFO; "auto": all nodes with a live camera, else capture and optimize; of perceive the frames go by nice -20
     fifo: Literal["auto", "on", "off"] = "auto"
     lock_memory: Literal["auto", "on", "off"] = "auto"  # nothing is paged out; "auto": with a live camera
     capture: NodeScheduling = NodeScheduling(priority=30)
