@@ -83,6 +83,8 @@ GROUPS = (
             "models.completion": "Are lanes completed where something hid the road (ENet)?",
             "source.detections": "Which file has another detector's boxes, in place of a network's? MOT, KITTI "
             'tracking or COCO results; "": none',
+            "source.detector": "Which family is that detector of, by which its boxes' edges are more or less sure? "
+            "configured: by slam.frontend.localisation.sigma_box_rel and sigma_box_px",
             "runtime.models_dir": 'Where do installed networks lie? "": in the user\'s own folder',
         },
     ),
@@ -212,7 +214,7 @@ GROUPS = (
             "runtime.restart_window_s": "Within which time do these restarts count?",
             "runtime.spares": "Does a process of each node stand by for that, loaded and warm?",
             "realtime.fifo": 'Do nodes go before all else (SCHED_FIFO)? "auto": all of them with a live camera, else '
-            "capture, optimize and the frames of perceive",
+            "capture and optimize, and perceive's frames before its networks",
             "realtime.lock_memory": 'Does their memory stay in RAM? "auto": with a live camera',
             "realtime.NODE.priority": "Which priority has a node, under SCHED_FIFO?",
             "realtime.NODE.cpus": "On which cores may it run? none: all",

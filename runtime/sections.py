@@ -7,6 +7,7 @@ from typing import Annotated, Literal, get_args
 import msgspec
 
 from birdslam.perception import ModelSpec
+from birdslam.perception.families import Family
 from birdslam.perception.manifest import SHIPPED_MULTITASK, SHIPPED_NETWORKS, Role
 from birdslam.perception.network import Provider
 from birdslam.ros.bag import BagTopics
@@ -28,6 +29,7 @@ class SourceConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     # FILE of another odometry over a recording, in place of the images': TUM lines or KITTI rows, metric; "": none
     odometry: str = ""
     detections: str = ""  # FILE of another detector's boxes over a recording: MOT, KITTI tracking or COCO; "": none
+    detector: Family = "unknown"  # whose boxes these are, which says how sure their edges are
     topics: BagTopics = BagTopics()  # of a ROS bag
     frames: PositiveInt | None = None  # end after so many; None: all
     loop: bool = False  # a recording begins anew at its end
@@ -290,7 +292,7 @@ class NodeScheduling(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 class RealtimeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The scheduling of the nodes, where the system permits it (process/realtime.py); a line in the log where not."""
 
-    # SCHED_FIFO; "auto": all nodes with a live camera, else capture, optimize and of perceive what is not a network
+    # SCHED_FIFO; "auto": all nodes with a live camera, else capture and optimize; of perceive the frames go by nice -20
     fifo: Literal["auto", "on", "off"] = "auto"
     lock_memory: Literal["auto", "on", "off"] = "auto"  # nothing is paged out; "auto": with a live camera
     capture: NodeScheduling = NodeScheduling(priority=30)

@@ -19,9 +19,13 @@ from birdslam.geometry.se2 import SE2
 from birdslam.integrations import norfair as norfair_adapter
 from birdslam.integrations import supervision as supervision_adapter
 from birdslam.perception import Detections
+from birdslam.perception.decoding.detection import EdgeSigma
 from birdslam.perception.external import external_detections, undistort_boxes
+from birdslam.perception.families import FAMILIES, UNKNOWN
+from birdslam.perf.perception.box_edges import Edges, fitted
 from birdslam.runtime.batch.offline import pipeline
 from birdslam.runtime.configuration import Configuration, ConfigurationError, load
+from birdslam.runtime.nodes.inference import source_detections
 from birdslam.runtime.nodes.sources import open_source
 from birdslam.sources.detection_file import check_detections, read_detection_file
 from birdslam.sources.recording import DatasetError
@@ -169,6 +173,40 @@ def test_a_box_of_a_distorted_image_is_undistorted_as_the_image_is(
 def undistort_points_back(px: np.ndarray) -> np.ndarray:
     K = LENS.K
     return cv2.undistortPoints(px.reshape(-1, 1, 2), K, np.array(LENS.distortion), P=K).reshape(-1, 2)
+
+
+def test_how_sure_edges_are_goes_by_the_detectors_family(tmp_path: Path) -> None:
+    boxes, labels = [[10.0, 20.0, 40.0, 60.0]], ["car"]
+    assert external_detections(boxes, labels).edge_sigma == UNKNOWN
+    assert external_detections(boxes, labels, detector="configured").edge_sigma is None
+    for family, sigma in FAMILIES.items():
+        assert external_detections(boxes, labels, detector=family).edge_sigma == sigma
+        assert all(of <= widest for of, widest in zip(sigma.rel, UNKNOWN.rel, strict=True))
+    own = EdgeSigma((0.01, 0.02, 0.03, 0.04), 0.5)
+    theirs = [Corners(np.array([[10.0, 20.0], [40.0, 60.0]]))]
+    assert norfair_adapter.from_norfair(theirs, detector=own).edge_sigma == own
+    with pytest.raises(ValueError, match="no family of detectors 'yolo'; there are rrc, yolox"):
+        external_detections(boxes, labels, detector="yolo")  # type: ignore[arg-type]
+    file = tmp_path / "boxes.txt"
+    file.write_text("1,-1,10,20,30,40,0.9\n")
+    configuration = load(None, {"source.detections": str(file), "source.detector": "yolox"})
+    read = source_detections(configuration)
+    assert read is not None
+    assert read[0].edge_sigma == FAMILIES["yolox"]
+    with pytest.raises(ConfigurationError, match=r"source\.detector"):
+        load(None, {"source.detector": "yolo"})
+
+
+def test_edges_are_measured_for_what_they_scatter() -> None:
+    rng, n = np.random.default_rng(1), 4000
+    side, wider = rng.uniform(25.0, 200.0, (n, 4)), rng.choice([1.0, 1.8], (n, 1))
+    rel = np.array([0.03, 0.03, 0.02, 0.05])
+    off = rng.normal(size=(n, 4)) * wider * np.hypot(side * rel, 0.5)
+    found = fitted(Edges(off, side, wider))
+    assert np.abs(np.array(found.rel) - rel).max() < 0.004
+    assert all(
+        abs(one - 0.683) < 0.06 and abs(two - 0.954) < 0.03 for one, two in Edges(off, side, wider).shares(found)
+    )
 
 
 def test_all_three_kinds_of_file_are_read(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 import resource
 import shutil
 import subprocess
@@ -40,6 +41,7 @@ from birdslam.runtime.nodes.meter import PERIOD_NS, Meter
 from birdslam.runtime.process import realtime
 from birdslam.runtime.process.cores import quota
 from birdslam.runtime.process.restarts import Assignment
+from birdslam.runtime.slices import SHORT_NS, own_threads, wake_soon
 from birdslam.runtime.supervision.live import LiveLine
 from birdslam.runtime.supervision.logbook import Logbook
 from birdslam.runtime.topology import NODES
@@ -185,24 +187,53 @@ def test_who_computes_little_goes_before_networks(monkeypatch: pytest.MonkeyPatc
 
 
 def test_of_perceive_the_frames_go_before_the_networks(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[tuple[int, int, int]] = []
-    monkeypatch.setattr(realtime, "frames_alone", threading.Event())
-    monkeypatch.setattr(
-        os, "sched_setscheduler", lambda thread, policy, of: asked.append((thread, policy, of.sched_priority))
-    )
+    asked: list[tuple[int, int]] = []
+    slices: list[tuple[list[int], int]] = []
+    own, usual = threading.get_native_id(), os.getpriority(os.PRIO_PROCESS, 0)
+    monkeypatch.setattr(realtime, "_usual_nice", [])  # private: of the whole process
+    monkeypatch.setattr(os, "sched_setscheduler", lambda *of: pytest.fail("planners would wake behind SCHED_FIFO"))
+    monkeypatch.setattr(os, "setpriority", lambda which, thread, nice: asked.append((thread, nice)))
+    monkeypatch.setattr(realtime, "wake_soon", lambda threads, ns=SHORT_NS: slices.append((threads, ns)))
     monkeypatch.setattr(realtime, "usable_cores", lambda: 1.0)
     assert list(realtime.apply("perceive", at_rate(33.0))) == []
     realtime.below_frames()
-    assert asked == []  # they would leave the networks no core
+    assert (asked, slices) == ([], [])  # they would leave the networks no core
     monkeypatch.setattr(realtime, "usable_cores", lambda: 2.0)
     assert list(realtime.apply("perceive", at_rate(33.0))) == []
     realtime.below_frames()
-    frames = (threading.get_native_id(), os.SCHED_FIFO, scheduled().realtime.perceive.priority)
-    assert asked == [frames, (0, os.SCHED_OTHER, 0)]  # this thread alone, then one of a network
-    monkeypatch.setattr(realtime, "frames_alone", threading.Event())
-    monkeypatch.setattr(os, "sched_setscheduler", refused)
+    assert asked == [(own, -20), (own, usual)]  # this thread alone, then one of a network
+    assert slices == [([own], SHORT_NS), ([own], 0)]
+    monkeypatch.setattr(realtime, "_usual_nice", [])  # private: of the whole process
+    monkeypatch.setattr(os, "setpriority", refused)
     assert list(realtime.apply("perceive", at_rate(33.0))) == []
     realtime.below_frames()  # asks for nothing where nothing was given
+
+
+def test_a_thread_gets_a_short_slice_and_keeps_its_nice_value() -> None:
+    begun, over = threading.Event(), threading.Event()
+    thread = threading.Thread(target=lambda: (begun.set(), over.wait()))
+    thread.start()
+    begun.wait()
+    assert thread.native_id is not None
+
+    def slice_ns() -> int | None:
+        text = Path(f"/proc/self/task/{thread.native_id}/sched").read_text()
+        found = re.search(r"^se\.slice\s*:\s*(\d+)", text, re.MULTILINE)
+        return int(found[1]) if found else None
+
+    try:
+        usual, nice = slice_ns(), os.getpriority(os.PRIO_PROCESS, thread.native_id)
+        if usual is None:
+            pytest.skip("this kernel shows no slices")
+        assert thread.native_id in own_threads()
+        wake_soon([thread.native_id, 1 << 22])  # the second has ended
+        assert slice_ns() == SHORT_NS
+        assert os.getpriority(os.PRIO_PROCESS, thread.native_id) == nice
+        wake_soon([thread.native_id], 0)
+        assert slice_ns() == usual
+    finally:
+        over.set()
+        thread.join()
 
 
 @pytest.mark.parametrize("configuration", [scheduled(), at_rate(1000.0)])

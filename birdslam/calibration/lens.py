@@ -95,9 +95,9 @@ def self_calibrate(
     """The lens that the corners of a drive's raw images show; None where there is too little to see.
 
     `focal_px` with its 1-sigma is what is known beforehand. Where it is `by_view` across the image, nobody knows
-    whether the view was counted with the lens's distortion or without: the sigma covers both. The focal length trades
-    against turns and lateral motion in a narrow valley: so it is looked for from several. `bend`: that of a pinhole by
-    upright lines (uprights.py), with its 1-sigma.
+    whether the view was counted with the lens's distortion or without: the sigma covers both, and how sure the
+    distortion is. The focal length trades against turns and lateral motion in a narrow valley: so it is looked for from
+    several. `bend`: that of a pinhole by upright lines (uprights.py), with its 1-sigma.
     """
     k1_before = 0.0, SIGMA_K1
     if bend is not None and not fisheye:
@@ -111,11 +111,14 @@ def self_calibrate(
     fitted = adjust(begun)
     again = begin(windows, focal_px, fitted.k1, sigma_px, fisheye, k1_before)
     fitted = fitted if again is None else adjust(again)
-    if by_view:
-        half = 0.5 * size_px[0] / focal_px
-        focal_sigma_rel = math.hypot(focal_sigma_rel, math.log(max(1.0 + fitted.k1 * half**2, 0.3)))
     prior = FocalPrior(math.log(focal_px), focal_sigma_rel)
     turned_rad, sigmas = _turned_rad(fitted), _sigmas(fitted, prior)
+    if by_view:
+        k1_sigma, edge2 = min(float(sigmas[0]), k1_before[1]), (0.5 * size_px[0] / focal_px) ** 2
+        distorts = math.log(max(1.0 + fitted.k1 * edge2, 0.3))
+        focal_sigma_rel = math.hypot(focal_sigma_rel, distorts, k1_sigma * edge2)
+        prior = FocalPrior(math.log(focal_px), focal_sigma_rel)
+        sigmas = _sigmas(fitted, prior)
     shown = False
     if turned_rad > _LEAST_TURN_RAD:
         found = _with_focal_length(windows, fitted, prior)

@@ -8,17 +8,20 @@ from typing import Any
 import numpy as np
 
 from birdslam.geometry.camera import Camera
-from birdslam.perception.decoding.detection import Detections
+from birdslam.perception.decoding.detection import Detections, EdgeSigma
 from birdslam.perception.external import external_detections
+from birdslam.perception.families import Family
 from birdslam.vehicles.placed_boxes import PlacedBox
 
 KEY = "birdslam"  # in a detection's data
 
 
-def from_norfair(objects: Sequence[Any], distorted: Camera | None = None) -> Detections:
+def from_norfair(
+    objects: Sequence[Any], distorted: Camera | None = None, detector: Family | EdgeSigma = "unknown"
+) -> Detections:
     """Boxes of `norfair.Detection` (points (2, 2): two corners), or of `norfair.TrackedObject`, whose ids are kept.
 
-    In the same order. `distorted` is as of `external_detections`. Raises ValueError for what is no box.
+    In the same order. `distorted` and `detector` are as of `external_detections`. Raises ValueError for what is no box.
     """
     boxes, scores, ids = [], [], []
     for each in objects:
@@ -31,7 +34,8 @@ def from_norfair(objects: Sequence[Any], distorted: Camera | None = None) -> Det
         number = getattr(each, "id", None)
         ids.append(-1 if number is None else int(number))
     labels = [str(each.label) for each in objects]
-    return external_detections(boxes, labels, scores, ids if any(i >= 0 for i in ids) else None, distorted=distorted)
+    known = ids if any(i >= 0 for i in ids) else None
+    return external_detections(boxes, labels, scores, known, distorted=distorted, detector=detector)
 
 
 def add_metres(objects: Sequence[Any], placed: Sequence[PlacedBox | None]) -> None:

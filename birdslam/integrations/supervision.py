@@ -12,8 +12,9 @@ from typing import Any, Protocol
 import numpy as np
 
 from birdslam.geometry.camera import Camera
-from birdslam.perception.decoding.detection import Detections
+from birdslam.perception.decoding.detection import Detections, EdgeSigma
 from birdslam.perception.external import external_detections
+from birdslam.perception.families import Family
 from birdslam.vehicles.placed_boxes import PlacedBox
 
 CLASS_NAME = "class_name"  # supervision's own column
@@ -30,11 +31,14 @@ class SupervisionDetections(Protocol):
 
 
 def from_supervision(
-    detections: SupervisionDetections, names: Mapping[int, str] | None = None, distorted: Camera | None = None
+    detections: SupervisionDetections,
+    names: Mapping[int, str] | None = None,
+    distorted: Camera | None = None,
+    detector: Family | EdgeSigma = "unknown",
 ) -> Detections:
     """For `BirdSLAM.step`, in the same order; a tracker's ids are kept.
 
-    Classes are named by the column `class_name`, or by `names` (class_id -> name). `distorted` is as of
+    Classes are named by the column `class_name`, or by `names` (class_id -> name). `distorted` and `detector` are as of
     `external_detections`. Raises ValueError where no class has a name, and for numbers that are none.
     """
     count = len(detections.xyxy)
@@ -46,9 +50,8 @@ def from_supervision(
         labels = []
     else:
         raise ValueError("supervision: boxes have no class_name; give names={class_id: name}")
-    return external_detections(
-        detections.xyxy, labels, detections.confidence, detections.tracker_id, distorted=distorted
-    )
+    boxes, scores, ids = detections.xyxy, detections.confidence, detections.tracker_id
+    return external_detections(boxes, labels, scores, ids, distorted=distorted, detector=detector)
 
 
 def add_metres(detections: SupervisionDetections, placed: Sequence[PlacedBox | None]) -> None:

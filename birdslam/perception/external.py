@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.perception.decoding.detection import Detections, EdgeSigma
+from birdslam.perception.families import Family, sigma_of
 from birdslam.perception.manifest import LowerEdge
 
 
@@ -19,14 +20,15 @@ def external_detections(
     track_ids: ArrayLike | None = None,
     *,
     distorted: Camera | None = None,
-    edge_sigma: EdgeSigma | None = None,
+    detector: Family | EdgeSigma = "unknown",
     lower_edge: LowerEdge = "body",
 ) -> Detections:
     """Boxes (N, 4) x1, y1, x2, y2 in px with a label each, for `BirdSLAM.step`; they keep their order.
 
     `scores` (N,) in [0, 1], 1 where left out. `track_ids` (N,) are another tracker's, which are kept; a negative one is
     of no track yet. `distorted`: the boxes were drawn on this camera's images as they come, not on undistorted ones.
-    `edge_sigma` is the 1-sigma of their edges, where it was measured. Raises ValueError for numbers that are none.
+    `detector` is its family, which says how sure edges are (families.py), or that 1-sigma where it was measured. Raises
+    ValueError for numbers that are none, and for a family that is none.
     """
     boxes = np.asarray(boxes_px, np.float64).reshape(-1, 4) if np.size(boxes_px) else np.zeros((0, 4))
     count = len(boxes)
@@ -50,6 +52,7 @@ def external_detections(
         ids = ids.astype(np.int64)
     if distorted is not None:
         boxes = undistort_boxes(distorted, boxes)
+    edge_sigma = detector if isinstance(detector, EdgeSigma) else sigma_of(detector)
     return Detections(boxes, sure, tuple(labels), None, edge_sigma, lower_edge, ids)
 
 

@@ -15,8 +15,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from birdslam.perception.decoding.detection import Detections
+from birdslam.perception.decoding.detection import Detections, EdgeSigma
 from birdslam.perception.external import external_detections
+from birdslam.perception.families import Family
 from birdslam.sources.recording import DatasetError, Recording
 
 # COCO's category ids of who is on a road; others are boxes without a meaning here
@@ -37,8 +38,11 @@ class _Box(NamedTuple):
     score: float
 
 
-def read_detection_file(path: Path) -> dict[int, Detections]:
-    """Frame -> its boxes, in the order of the file; a frame without an entry has none. Raises DatasetError."""
+def read_detection_file(path: Path, detector: Family | EdgeSigma = "unknown") -> dict[int, Detections]:
+    """Frame -> its boxes, in the order of the file; a frame without an entry has none. Raises DatasetError.
+
+    `detector` is as of `external_detections`.
+    """
     try:
         if path.stat().st_size > _MOST_BYTES:
             raise DatasetError(f"{path}: is larger than {_MOST_BYTES >> 30} GiB")
@@ -50,7 +54,7 @@ def read_detection_file(path: Path) -> dict[int, Detections]:
         frames.setdefault(box.frame, []).append((where, box))
     if not frames:
         raise DatasetError(f"{path}: holds no boxes")
-    return {frame: _of_frame(path, boxes) for frame, boxes in frames.items()}
+    return {frame: _of_frame(path, boxes, detector) for frame, boxes in frames.items()}
 
 
 def check_detections(recording: Recording, path: Path, stride: int = 1) -> None:
@@ -70,7 +74,7 @@ def check_detections(recording: Recording, path: Path, stride: int = 1) -> None:
             raise DatasetError(f"{path}: frame {frame} has {box} outside of the image of {width_px}x{height_px} px")
 
 
-def _of_frame(path: Path, boxes: list[tuple[str, _Box]]) -> Detections:
+def _of_frame(path: Path, boxes: list[tuple[str, _Box]], detector: Family | EdgeSigma) -> Detections:
     found = [box for _, box in boxes]
     ids = [box.track for box in found]
     try:
@@ -79,6 +83,7 @@ def _of_frame(path: Path, boxes: list[tuple[str, _Box]]) -> Detections:
             [box.label for box in found],
             [box.score for box in found],
             ids if max(ids) >= 0 else None,
+            detector=detector,
         )
     except ValueError as error:
         raise DatasetError(f"{path}: {boxes[0][0]} to {boxes[-1][0]}: {error}") from None

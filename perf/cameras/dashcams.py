@@ -194,9 +194,11 @@ def measure(seed: int, seconds: float, folder: Path, configuration: Configuratio
     true = drawn.dashcam.camera
     sigma_rel = found.camera.scale_sigma_rel
     off, pitch_mrad = found.camera.fx_px / true.fx_px - 1.0, 1e3 * (found.camera.pitch_rad - true.pitch_rad)
+    roll_mrad = 1e3 * (found.camera.roll_rad - true.roll_rad)
     return {
         "dashcam": drawn.words,
-        "lens": f"{stated}: f {off:+.0%}, pitch {pitch_mrad:+.0f} mrad off, lengths +- {sigma_rel:.0%}",
+        "lens": f"{stated}: f {off:+.0%}, pitch {pitch_mrad:+.0f} and roll {roll_mrad:+.0f} mrad off, "
+        f"lengths +- {sigma_rel:.0%}",
         "focal_over_true": found.camera.fx_px / true.fx_px,
         "speed_mps": float(way_m[-1] / times_s[-1]),
         **summary(course),

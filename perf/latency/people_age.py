@@ -56,7 +56,7 @@ def run(arguments: list[str]) -> None:
             source=f"demo:{place / 'street'}",
             rate=options.rate,
             seconds=options.seconds,
-            settings=(f"source.detections={place / 'boxes.txt'}",),
+            settings=(f"source.detections={place / 'boxes.txt'}", "source.detector=configured"),
             loop=False,
         )
         steal = Steal()

@@ -92,7 +92,7 @@ def driven(scenario: Scenario, count: int, rate_hz: float, samples: int = 1) -> 
         t_ns = truth.t_source_ns
         found, labels, scores = boxes(truth, rng)
         frame = Frame(frame_id=truth.frame_id, t_source_ns=t_ns, t_capture_ns=t_ns, t_utc_ns=t_ns, image=truth.image)
-        _, estimate, _ = slam.step(frame, external_detections(found, labels, scores))
+        _, estimate, _ = slam.step(frame, external_detections(found, labels, scores, detector="configured"))
         yield Step(truth, estimate, took["people"], took["graph"])
 
 

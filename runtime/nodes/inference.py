@@ -44,8 +44,8 @@ log = logging.getLogger(__name__)
 
 def source_detections(configuration: Configuration) -> dict[int, Detections] | None:
     """Frame -> another detector's boxes of the file that is configured; None: there is none. Raises DatasetError."""
-    file = configuration.source.detections
-    return read_detection_file(Path(file).expanduser()) if file else None
+    source = configuration.source
+    return read_detection_file(Path(source.detections).expanduser(), source.detector) if source.detections else None
 
 
 class Inference(Closing):

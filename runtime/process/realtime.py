@@ -17,6 +17,7 @@ from collections.abc import Iterable, Iterator
 
 from birdslam.runtime.configuration import Configuration
 from birdslam.runtime.process.cores import usable_cores
+from birdslam.runtime.slices import wake_soon
 
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 _CAP_IPC_LOCK, _CAP_SYS_NICE = 14, 23
@@ -28,8 +29,10 @@ _MIB = 1 << 20
 # two cores, beside perceive alone, a step of the optimizer took p99 2.3 to 4.6 ms at SCHED_FIFO, 4.5 to 11.8 at nice -5
 _FIRST, _FIRST_NICE = ("capture", "optimize"), -5
 # Of perceive the thread of the frames, and the bus's, which it begins; its networks get what is left, a core or more.
-# On two cores beside other work that thread waited for a core for p99 25 ms of a frame, at SCHED_FIFO for 7
-_FRAMES, _FRAMES_CORES = "perceive", 2.0
+# It works for 10 ms of a frame: at SCHED_FIFO the kernel, which sees no load in that, wakes planners behind it. On two
+# cores beside a load of 11 a planner had an estimate p99 29 to 80 ms after it was sent; with this nice value 26 to 47,
+# with a short slice of this thread and of the planner's 7 and 14, the age at the planner p99 74 to 124 and 63, 86 ms
+_FRAMES, _FRAMES_CORES, _FRAMES_NICE = "perceive", 2.0, -20
 _LEAST_PERIOD_MS = 10.0  # of frames, for SCHED_FIFO: at more than 100 Hz they would leave no core to the others
 _LOWER_NICE = 5  # nicer: a third of the time that one gets that wants the same core and is not
 _NICEST = 19
@@ -39,7 +42,7 @@ NODE_OBJECTS_MIB, NODE_HEAP_MIB = 8.0, 4.0
 
 _TUPLE_SIZES, _TUPLES_KEPT = range(1, 21), 2_000  # what CPython keeps of freed ones, of each size
 
-frames_alone = threading.Event()  # SCHED_FIFO is of the frames' thread, not of the networks'
+_usual_nice: list[int] = []  # of the networks, where the frames' thread has one of its own
 _anchors: list[bytes] = []  # for ever: memory that holds one of these is not given back
 
 
@@ -59,8 +62,8 @@ def apply(node: str, configuration: Configuration) -> Iterator[str]:
     seldom = (configuration.perceive.period_ms or 0.0) >= _LEAST_PERIOD_MS
     by_fifo = (every or (first and seldom and realtime.fifo == "auto")) and _by_fifo(_threads(), scheduling.priority)
     frames = node == _FRAMES and not every and not configuration.lossless and usable_cores() >= _FRAMES_CORES
-    if frames and seldom and realtime.fifo == "auto" and _by_fifo([threading.get_native_id()], scheduling.priority):
-        frames_alone.set()
+    if frames and seldom and realtime.fifo == "auto":
+        _frames_first()
     if every and not by_fifo:
         yield "realtime.fifo: SCHED_FIFO is not permitted (LimitRTPRIO=, CAP_SYS_NICE): runs at normal priority"
     if first and not by_fifo:
@@ -85,10 +88,22 @@ def _by_fifo(threads: Iterable[int], priority: int) -> bool:
     return True
 
 
+def _frames_first() -> None:
+    """The calling thread, and those that it begins, go before the networks."""
+    thread = threading.get_native_id()
+    usual = os.getpriority(os.PRIO_PROCESS, thread)
+    with contextlib.suppress(PermissionError):  # who may not: it waits for a core like the others
+        os.setpriority(os.PRIO_PROCESS, thread, _FRAMES_NICE)
+        wake_soon([thread])
+        _usual_nice.append(usual)
+
+
 def below_frames() -> None:
-    """The calling thread runs a network that frames wait for: not at SCHED_FIFO, where that is the frames' alone."""
-    if frames_alone.is_set():
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    """The calling thread runs a network that frames wait for: as any other where the frames' thread goes first."""
+    if _usual_nice:
+        thread = threading.get_native_id()
+        os.setpriority(os.PRIO_PROCESS, thread, _usual_nice[0])
+        wake_soon([thread], 0)
 
 
 def lower_priority() -> None:

@@ -15,6 +15,7 @@ from typing import Any
 
 import zenoh
 
+from birdslam.runtime.slices import own_threads, wake_soon
 from birdslam.runtime.topology import PROCESSES, TOPICS, alive_key, check_name, key_of
 from birdslam.runtime.transport.closing import Closing
 from birdslam.runtime.transport.endpoints import (
@@ -67,11 +68,14 @@ class Bus(Closing):
         directory = runtime_dir_of(vehicle, runtime_dir)
         hub_socket, own_socket = socket_path(directory, "hub"), socket_path(directory, node)
         listen = [hub_socket] if hub else [own_socket] if node in PROCESSES else []
+        before = own_threads()
         try:
             self._session = open_session(session_config(listen, [] if hub else [hub_socket], lossless))
         except zenoh.ZError as error:
             where = ", ".join(map(str, listen)) or hub_socket
             raise BusError(f"{node} can't join the bus of vehicle {vehicle!r} ({where}): {error}") from error
+        if node not in PROCESSES:  # planners and other readers: of what comes they know at once
+            wake_soon(own_threads() - before)
         callback = zenoh.handlers.Callback(self._liveliness_changed, indirect=False)
         key = alive_key(vehicle, "*")
         self._liveliness = self._session.liveliness().declare_subscriber(key, callback, history=True)

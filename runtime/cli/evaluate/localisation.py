@@ -109,10 +109,11 @@ def _places(row: PeopleRow | LocalisationRow) -> str:
 
 
 def _table_of_people(rows: Sequence[PeopleRow]) -> str:
-    titles = f"{_PLACES}{'walking':>9}{'standing':>9}"
+    titles = f"{_PLACES}{'walking':>9}{'away':>7}{'across':>8}{'standing':>9}"
     lines = [f"{'sequence':11}{'range m':>9}{'n':>7}{titles}  (m/s: error of who walks, speed of who stands)"]
     for row in rows:
-        speeds = (row.walking_speed_error_median_mps, "9.2f"), (row.standing_speed_median_mps, "9.2f")
+        parts = (row.walking_along_ray_median_mps, "7.2f"), (row.walking_across_ray_median_mps, "8.2f")
+        speeds = (row.walking_speed_error_median_mps, "9.2f"), *parts, (row.standing_speed_median_mps, "9.2f")
         lines.append(f"{row.sequence:11}{row.range:>9}{row.n:>7}{_places(row)}{_in_columns(speeds)}")
     return "\n".join(lines)
 

@@ -50,6 +50,7 @@ class PersonError:
     label: int
     frame: int
     depth_m: float
+    true_ray: Floats  # (2,) of length 1, from the camera's foot to the person
     error_m: Floats
     mahalanobis2: float
     log_det_cov: float
@@ -80,8 +81,10 @@ class PeopleRow(msgspec.Struct, frozen=True, kw_only=True):
     lateral_error_median_m: float | None = None
     inside_1_sigma: float | None = None
     inside_2_sigma: float | None = None
-    walking_speed_error_median_mps: float | None = None
+    walking_speed_error_median_mps: float | None = None  # of the velocity's both components together
     standing_speed_median_mps: float | None = None
+    walking_along_ray_median_mps: float | None = None  # its part away from the camera, which only sizes and rows show
+    walking_across_ray_median_mps: float | None = None
 
 
 def has_labels(sequence: TrackingSequence, kind: str) -> bool:
@@ -185,6 +188,7 @@ def _error(
         label=label.track,
         frame=label.frame,
         depth_m=truth.x_m,
+        true_ray=np.array([truth.x_m, truth.y_m]) / math.hypot(truth.x_m, truth.y_m),
         error_m=error,
         mahalanobis2=float(error @ np.linalg.solve(np.reshape(person.cov, (2, 2)), error)),
         log_det_cov=float(np.linalg.slogdet(np.reshape(person.cov, (2, 2)))[1]),
@@ -222,6 +226,9 @@ def _row(sequence: str, span: str, errors: Sequence[PersonError]) -> PeopleRow:
     estimated = np.array([e.estimated_mps for e in errors])
     speed = np.linalg.norm(true, axis=1)
     walking, standing = speed > WALKING_MPS, speed < STANDING_MPS
+    off = estimated - true
+    ray = np.array([e.true_ray for e in errors])
+    off_along, off_across = (off * ray).sum(axis=1), off[:, 1] * ray[:, 0] - off[:, 0] * ray[:, 1]
     return PeopleRow(
         sequence=sequence,
         range=span,
@@ -231,6 +238,8 @@ def _row(sequence: str, span: str, errors: Sequence[PersonError]) -> PeopleRow:
         lateral_error_median_m=float(np.median(np.abs(across))),
         inside_1_sigma=float(np.mean(spread <= INSIDE_1_SIGMA)),
         inside_2_sigma=float(np.mean(spread <= INSIDE_2_SIGMA)),
-        walking_speed_error_median_mps=median(np.linalg.norm(estimated - true, axis=1)[walking]),
+        walking_speed_error_median_mps=median(np.linalg.norm(off, axis=1)[walking]),
         standing_speed_median_mps=median(np.linalg.norm(estimated, axis=1)[standing]),
+        walking_along_ray_median_mps=median(np.abs(off_along)[walking]),
+        walking_across_ray_median_mps=median(np.abs(off_across)[walking]),
     )

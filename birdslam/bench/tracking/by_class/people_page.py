@@ -18,8 +18,8 @@ class PeopleReport(msgspec.Struct, frozen=True):
 
 _CHOSEN = (
     "Sequences 0002, 0013, 0016 and 0017 chose constants of the filter ([constants.md](constants.md)); in 0016 and "
-    "0017 the ego stands. Walking: the median error of the speed of who walks; standing: the median speed reported of "
-    "who stands."
+    "0017 the ego stands. Walking: the median error of the velocity of who walks, and its parts away from the camera "
+    "and across; standing: the median speed reported of who stands."
 )
 _BOXES = {
     "pedestrian": "Boxes of people are those that RRC recorded.",
@@ -45,7 +45,8 @@ def _page(title: str, name: str, kind: str, text: str) -> str:
             *(_percent(row.depth_error_median_rel, 1), _percent(row.depth_bias_median_rel, 1)),
             number(row.lateral_error_median_m),
             *(_percent(row.inside_1_sigma), _percent(row.inside_2_sigma)),
-            *(number(row.walking_speed_error_median_mps), number(row.standing_speed_median_mps)),
+            *(number(row.walking_speed_error_median_mps), number(row.walking_along_ray_median_mps)),
+            *(number(row.walking_across_ray_median_mps), number(row.standing_speed_median_mps)),
         ]
         for row in report.places
         if row.n
@@ -65,7 +66,7 @@ def _page(title: str, name: str, kind: str, text: str) -> str:
             "",
             f"Written by `python -m perf pages --write {name}`. {_BOXES[kind]} {_CHOSEN}",
             "",
-            markdown([*head, "walking m/s", "standing m/s"], places),
+            markdown([*head, "walking m/s", "away", "across", "standing m/s"], places),
             "Tracks in bird's-eye view (within 2 m) and in the image (IoU of 0.5):",
             "",
             markdown(
