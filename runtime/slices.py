@@ -32,7 +32,7 @@ def wake_soon(threads: Iterable[int], slice_ns: int = SHORT_NS) -> None:
             if os.sched_getscheduler(thread) != os.SCHED_OTHER:
                 continue
             nice = os.getpriority(os.PRIO_PROCESS, thread)
-        except ProcessLookupError:  # it has ended
+        except OSError:  # it has ended, or may not be asked for
             continue
         system_call(number, thread, _ATTRIBUTES.pack(_ATTRIBUTES.size, os.SCHED_OTHER, 0, nice, 0, slice_ns, 0, 0), 0)
 

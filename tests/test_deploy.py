@@ -353,3 +353,21 @@ def test_install_start_break_and_remove(machine: Machine) -> None:
     install(machine, "uninstall", "--purge")
     assert machine("sh", "-c", "ls -d /etc/birdslam /var/lib/birdslam; id birdslam", check=False) == ""
     install(machine, "uninstall", "--purge")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_the_node_of_ros_2_starts_and_lives_without_its_router(machine: Machine) -> None:
+    install(machine)
+    machine.write("/etc/birdslam/vehicle.toml", LOOP)
+    machine("systemctl", "restart", "birdslam")
+    machine("systemctl", "start", "birdslam-ros")
+    assert machine("systemctl", "is-active", "birdslam-ros") == "active"
+    machine.until(lambda: "router" in machine.journal("-u", "birdslam-ros"), "it says that it has no router")
+    main = machine.show("birdslam-ros", "MainPID")
+    assert estimates(machine)
+    assert (machine.show("birdslam-ros", "MainPID"), machine.show("birdslam-ros", "NRestarts")) == (main, "0")
+    assert machine("stat", "-c", "%U", f"/proc/{main}") == "birdslam"
+    machine("systemctl", "stop", "birdslam-ros")
+    assert machine.show("birdslam-ros", "Result") == "success"
+    machine("systemctl", "stop", "birdslam")

@@ -7,12 +7,14 @@ from pathlib import Path
 
 import geojson
 import gpxpy
+import msgspec
 import numpy as np
 import pymap3d
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.gnss.earth import Earth, EarthError, GnssFix, place_on_earth
 from birdslam.loops.gnss.files import GnssError, read_fixes
@@ -29,6 +31,9 @@ def a_drive(scale: float = 1.0) -> tuple[np.ndarray, list[SE2], np.ndarray]:
     poses = [SE2(float(x) / scale, float(y) / scale, 0.0) for x, y in way]
     c, s = math.cos(YAW_RAD), math.sin(YAW_RAD)
     return t_ns, poses, way @ np.array([[c, s], [-s, c]])
+
+
+CAMERA = Camera(width_px=1242, height_px=375, fx_px=720.0, fy_px=720.0, cx_px=621.0, cy_px=180.0, height_m=1.65)
 
 
 def fixes_of(t_ns: np.ndarray, enu: np.ndarray, noise_m: float, seed: int = 0) -> list[GnssFix]:
@@ -55,7 +60,7 @@ def test_a_drive_comes_to_its_place_on_earth() -> None:
     earth = place_on_earth(t_ns, poses, fixes_of(t_ns, enu, 1.0))
     assert worst_m(earth, poses, enu) < 1.5
     assert earth.yaw_rad == pytest.approx(YAW_RAD, abs=0.02)
-    assert earth.height_hint(1.65) == ""
+    assert earth.calibration_hint(CAMERA) == ""
 
 
 def test_fixes_fifteen_metres_off_for_ten_seconds_do_not_bend_it() -> None:
@@ -71,7 +76,18 @@ def test_a_wrong_camera_height_is_told() -> None:
     t_ns, poses, enu = a_drive(scale=0.94)
     earth = place_on_earth(t_ns, poses, fixes_of(t_ns, enu, 1.0))
     assert earth.scale == pytest.approx(0.94, abs=0.01)
-    assert "1.55 m instead of 1.65 m" in earth.height_hint(1.65)
+    assert "1.55 m instead of 1.65 m" in earth.calibration_hint(CAMERA)
+    assert "a view of 85 degrees across instead of 82" in earth.calibration_hint(CAMERA)
+
+
+def test_speeds_of_fixes_show_the_scale_where_their_places_hardly_do() -> None:
+    t_ns, poses, enu = a_drive(scale=0.94)
+    fixes = [msgspec.structs.replace(fix, sigma_m=30.0) for fix in fixes_of(t_ns, enu, 20.0)]
+    by_places = place_on_earth(t_ns, poses, fixes)
+    by_speeds = place_on_earth(t_ns, poses, [msgspec.structs.replace(fix, speed_mps=10.0) for fix in fixes])
+    assert by_speeds.speed_ratio == pytest.approx(1.0 / 0.94, abs=0.01)
+    assert by_speeds.scale == pytest.approx(0.94, abs=0.02)
+    assert by_speeds.cov[3, 3] < 0.1 * by_places.cov[3, 3]
 
 
 def test_late_fixes_are_found_out_by_the_turn() -> None:

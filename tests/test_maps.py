@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from birdslam.bench.simulation.places import CAMERA, OTHER_LIGHT_BITS, Street, along, block, build, drive
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.closing import close_loops, held
-from birdslam.loops.features import hamming, match, match_near
+from birdslam.loops.features import Features, hamming, match, match_near
 from birdslam.loops.foot import body_pose, foot
 from birdslam.loops.keyframe import Link
 from birdslam.loops.localiser import Localisation
@@ -25,7 +25,7 @@ from birdslam.loops.merging import MergeError, merged
 from birdslam.loops.place_index import PlaceIndex, learn_words
 from birdslam.loops.place_map import MapCamera, PlaceMap
 from birdslam.loops.session import MapSession
-from birdslam.loops.verification import locate
+from birdslam.loops.verification import LocalMap, locate
 from birdslam.outputs.map_trajectory import MapTrajectory, TrajectoryFiles
 from birdslam.perf.maps import scale_drift
 from birdslam.runtime.batch.one_map import DRIVE_MAP, join
@@ -34,6 +34,7 @@ from birdslam.runtime.configuration import ConfigurationError, load
 from birdslam.runtime.maps import held_way, map_drive
 from birdslam.runtime.maps.map_drive import MapChoice
 from birdslam.runtime.maps.map_store import read_map, write_map
+from birdslam.trajectory import mount_pose
 from birdslam.types import Attitude
 from tests.cases import first
 
@@ -177,6 +178,37 @@ def test_a_wrong_guess_is_left_for_the_place_that_near_points_show(mapped: bytes
     found = locate(CAMERA, replace(seen, px=px), local, guess, 120.0)
     assert found is not None
     assert found.T_keyframe_ego.between(truth.T_keyframe_ego).log() == pytest.approx(np.zeros(3), abs=0.1)
+
+
+def seen_from(points_m: np.ndarray, T_keyframe_ego: SE2) -> np.ndarray:
+    """(N, 2) pixels of points in a keyframe's ego frame."""
+    T = np.linalg.inv(body_pose(T_keyframe_ego, Attitude(), CAMERA.height_m) @ mount_pose(CAMERA.ground))
+    p = points_m @ T[:3, :3].T + T[:3, 3]
+    return CAMERA.to_px(p[:, :2] / p[:, 2:])
+
+
+@pytest.mark.parametrize("wrong", [4, 5, 7])
+def test_of_the_places_that_far_points_allow_it_is_the_likeliest_and_not_that_of_the_guess(
+    mapped: bytes, wrong: int
+) -> None:
+    chance = np.random.default_rng(0)
+    count, nearest_m, farthest_m = (30, 14), (30.0, 9.0), (60.0, 16.0)  # of far points, and of near ones
+    points = np.array(
+        [
+            (chance.uniform(*ahead_m), chance.uniform(-8.0, 8.0), chance.uniform(0.5, 4.0))
+            for n, *ahead_m in zip(count, nearest_m, farthest_m, strict=True)
+            for _ in range(n)
+        ]
+    )
+    guess = SE2.exp(np.array([0.0, 1.0, -0.022]))  # far points allow it, as they do the truth; so do a few near ones
+    px = seen_from(points, SE2()) + 0.5 * chance.standard_normal((len(points), 2))
+    px[-wrong:] = seen_from(points[-wrong:], guess)
+    descriptors = chance.integers(0, 256, (len(points), 32), dtype=np.uint8)
+    depth = 0.05 * (points - (0.0, 0.0, CAMERA.height_m))
+    local = LocalMap(decode_map(mapped).keyframes[0], points, depth, descriptors)
+    found = locate(CAMERA, Features(px, np.full(len(px), 0.5), descriptors), local, guess, 120.0)
+    assert found is not None
+    assert found.T_keyframe_ego.log() == pytest.approx(np.zeros(3), abs=0.1)
 
 
 def test_a_step_that_no_car_makes_is_no_localisation(mapped: bytes) -> None:

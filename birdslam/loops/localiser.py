@@ -158,14 +158,15 @@ class Localiser:
         self.fix = None
         if self._T_odom_ego is None or not len(self.map):
             return False
+        fix = None
         if self._T_map_ego is not None and self.since_fix_m < FOLLOWED_M:
             fix = self._follow(features, self._T_map_ego, self.cov, among)
-            # Who is not localised any more has to find as much as who was lost
-            if fix is not None and (self.state is MapState.LOCALISED or is_place(fix)):
+            if fix is not None and self.state is MapState.LOCALISED:
                 self._correct(fix)
                 return True
-            self._missed = bool(self.map.near(self._T_map_ego, FOLLOW_M, among))
-        return self._recognise(features, among)
+            if fix is None:
+                self._missed = bool(self.map.near(self._T_map_ego, FOLLOW_M, among))
+        return self._recognise(features, among, fix)
 
     def _follow(self, features: Features, guess: SE2, cov: Floats, among: Bools | None) -> Fix | None:
         """A fix where the ego is thought to be, if it is one by inliers and by chi-square."""
@@ -199,8 +200,12 @@ class Localiser:
         self.attitude = fix.attitude_in_map(self._camera)
         self.fix, self.since_fix_m, self._missed = fix, 0.0, False
 
-    def _recognise(self, features: Features, among: Bools | None) -> bool:
-        """Confirms hypotheses, or makes new ones of places that look alike."""
+    def _recognise(self, features: Features, among: Bools | None, foreseen: Fix | None) -> bool:
+        """Confirms hypotheses, or makes new ones of places that look alike.
+
+        `foreseen` is where odometry says: who is not localised any more has to find as much as who was lost, since a
+        fix from a wrong guess may be a wrong one.
+        """
         assert self._T_odom_ego is not None
         self._hypotheses = [h for h in self._hypotheses if self.travelled_m - h.travelled_m < HYPOTHESIS_M]
         for hypothesis in sorted(self._hypotheses, key=lambda h: -h.confirmed):
@@ -216,6 +221,9 @@ class Localiser:
                 self._believe(fix)
                 return True
             return False
+        if foreseen is not None and is_place(foreseen):
+            self._suppose(foreseen, kidnapped=False)
+            return False
         for row in self.map.index().look_up(features.descriptors, CANDIDATES, among):
             found = locate(self._camera, features, self.map.around(row, among), None)
             if found is None or not is_place(found):
@@ -223,12 +231,15 @@ class Localiser:
             kidnapped = self._contradicts(found, row)
             if kidnapped and row in self.own_way_m:  # a street that looks like an earlier one
                 continue
-            T_map_odom = found.T_map_ego @ self._T_odom_ego.inverse()
-            cov = found.cov + shared(found)
-            new = _Hypothesis(T_map_odom, cov, self.travelled_m, kidnapped=kidnapped)
-            self._hypotheses = [*self._hypotheses, new][-HYPOTHESES:]
+            self._suppose(found, kidnapped)
             break
         return False
+
+    def _suppose(self, fix: Fix, kidnapped: bool) -> None:
+        assert self._T_odom_ego is not None
+        T_map_odom, cov = fix.T_map_ego @ self._T_odom_ego.inverse(), fix.cov + shared(fix)
+        new = _Hypothesis(T_map_odom, cov, self.travelled_m, kidnapped=kidnapped)
+        self._hypotheses = [*self._hypotheses, new][-HYPOTHESES:]
 
     def _contradicts(self, fix: Fix, row: int) -> bool:
         """Chi-square against the drift: since the drive passed there itself, or since the last fix."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -33,6 +34,11 @@ RANSAC_PX, RANSAC_LOOKS = 4.0, 400
 GATE = 3.0  # standard deviations of a coordinate
 SIGMA_Z_M, SIGMA_TILT_RAD = 0.15, 0.03  # of a car on a road that another drive mapped
 ITERATIONS = 12
+FORESEEN_PX = 12.0  # within which matches are looked for again, once a pose was found by itself
+# Further maxima of the likelihood are looked for from so many starts forth and back, on the line of least knowledge
+STARTS, START_STEP_M = 4, 0.5
+MATCHES_AS_ONE = 4.0  # that err together, since their points are of one wall, or of one keyframe
+TINY = 1e-12
 NARROWER = 3.0  # by which the weights' bell shrinks from one iteration to the next
 NARROWEST = 9.0  # its width at the end, as a chi-square
 # For residuals as foreseen the weighed mean of chi-square is 1.49, and the covariance .81 of the weighed system's (the
@@ -108,18 +114,62 @@ def locate(
         pairs = _guided(camera, features, local, pose, radius_px)
     if pose is None or len(pairs) < 8:
         return None
+    matches = _Matches(camera, features, local, pairs, radius_px)
     if guess is None:  # again, with what the pose foresees
-        first = _adjust(camera, features, local, pairs, pose)
-        pose = first[0] if first is not None else pose
-        pairs = _guided(camera, features, local, pose, 12.0)
-    found = _adjust(camera, features, local, pairs, pose)
-    if found is None:
-        return None
-    pose, cov, good = found
-    T_keyframe_ego, attitude = foot(pose, camera.height_m)
-    cells = np.floor(features.px[pairs[good, 1]] / (camera.width_px, camera.height_px) * GRID_CELLS).astype(int)
+        first = _adjust(matches, pose)
+        pose = first.pose if first is not None else pose
+        pairs = _guided(camera, features, local, pose, FORESEEN_PX)
+        matches = _Matches(camera, features, local, pairs, FORESEEN_PX)
+    found = _adjust(matches, pose)
+    return None if found is None else _likeliest(matches, found)
+
+
+@dataclass(frozen=True, eq=False)
+class _Matches:
+    camera: Camera
+    features: Features
+    local: LocalMap
+    pairs: Ints  # (N, 2) rows of the local map's points, and of the features
+    radius_px: float  # within which they were looked for
+
+
+@dataclass(frozen=True, eq=False)
+class _Pose:
+    """One that the matches allow: a maximum of their likelihood."""
+
+    pose: Transform  # T_keyframe_ego
+    cov: Floats  # (3, 3) of (x, y, yaw) of the foot
+    good: Bools  # (N,) inliers
+    log_likelihood: float  # of each match either at its point, with its own noise, or anywhere within the radius
+
+
+def _likeliest(matches: _Matches, first: _Pose) -> Fix:
+    """The likeliest pose along the line on which the first one is known least; the covariance has the others in it.
+
+    Where most matches are wrong, what fits far points has several maxima on that line, and the one nearest to the guess
+    may be a wrong one with as many inliers.
+    """
+    h = matches.camera.height_m
+    at, attitude = foot(first.pose, h)
+    least = np.linalg.eigh(first.cov)[1][:, -1]
+    least = least / math.hypot(least[0], least[1])
+    steps_m = [START_STEP_M * n for n in range(-STARTS, STARTS + 1) if n]
+    starts = [body_pose(at @ SE2.exp(step_m * least), attitude, h) for step_m in steps_m]
+    found = [first, *filter(None, (_adjust(matches, start, NARROWEST) for start in starts))]
+    best, *others = sorted(found, key=lambda each: -each.log_likelihood)
+    T_best, attitude = foot(best.pose, h)
+    offs, weights = [np.zeros(3)], [1.0]
+    for other in others:
+        off = T_best.between(foot(other.pose, h)[0]).log()
+        if all(float((off - known) @ np.linalg.solve(best.cov, off - known)) > GATE**2 for known in offs):
+            offs.append(off)
+            weights.append(math.exp((other.log_likelihood - best.log_likelihood) / MATCHES_AS_ONE))
+    spread = np.einsum("k,ki,kj->ij", np.array(weights) / sum(weights), np.array(offs), np.array(offs))
+    size_px = matches.camera.width_px, matches.camera.height_px
+    cells = np.floor(matches.features.px[matches.pairs[best.good, 1]] / size_px * GRID_CELLS).astype(int)
     places = len(np.unique(cells, axis=0))
-    return Fix(local.keyframe, T_keyframe_ego, cov, int(good.sum()), len(pairs), places, attitude)
+    inliers = int(best.good.sum())
+    return Fix(matches.local.keyframe, T_best, best.cov + spread, inliers, len(matches.pairs), places, attitude)
 
 
 def _camera_pose(camera: Camera, T_keyframe_ego: Transform) -> Transform:
@@ -166,13 +216,13 @@ def _guided(camera: Camera, features: Features, local: LocalMap, pose: Transform
     return np.column_stack([rows[pairs[:, 0]], pairs[:, 1]])
 
 
-def _adjust(
-    camera: Camera, features: Features, local: LocalMap, pairs: Ints, pose: Transform
-) -> tuple[Transform, Floats, Bools] | None:
-    """Gauss-Newton with weights of Geman and McClure: T_keyframe_ego (4, 4), covariance of (x, y, yaw), inliers.
+def _adjust(matches: _Matches, pose: Transform, width: float = math.inf) -> _Pose | None:
+    """Gauss-Newton from a pose, with weights of Geman and McClure.
 
-    Graduated (Black and Rangarajan 1996): the weights are wide at first, or far points alone would hold a wrong guess.
+    Graduated (Black and Rangarajan 1996): the weights are wide at first, or far points alone would hold a wrong guess;
+    `width` is that of the weights' bell at the start, in standard deviations, squared.
     """
+    camera, features, local, pairs = matches.camera, matches.features, matches.local, matches.pairs
     if len(pairs) < 8:
         return None
     mount = mount_pose(camera.ground)
@@ -183,7 +233,8 @@ def _adjust(
     prior = np.array([0.0, 0.0, SIGMA_Z_M**-2, SIGMA_TILT_RAD**-2, SIGMA_TILT_RAD**-2, 0.0])
     good: Bools = np.ones(len(pairs), bool)
     H: Floats = np.eye(6)
-    width = math.inf  # of the weights' bell, in standard deviations, squared
+    W: NDArray[np.floating[Any]] = np.zeros((len(pairs), 2, 2))
+    chi2 = weight = np.zeros(len(pairs))
     for _ in range(ITERATIONS):
         p_ego = (points - pose[:3, 3]) @ pose[:3, :3]
         p = (p_ego - mount[:3, 3]) @ R_cam_ego.T
@@ -222,4 +273,7 @@ def _adjust(
     cov: Floats = J_foot @ np.linalg.inv(H) @ J_foot.T
     # The a posteriori variance of unit weight: residuals of an image with few right matches are larger than foreseen
     cov *= EFFICIENCY * max(1.0, float((weight * chi2).sum() / weight.sum()) / MEAN_CHI2)
-    return pose, cov, good
+    share = float(good.mean())
+    right = share * np.sqrt(np.linalg.det(W)) / (2.0 * math.pi) * np.exp(-0.5 * chi2)
+    wrong = (1.0 - share) * camera.fx_px**2 / (math.pi * matches.radius_px**2)
+    return _Pose(pose, cov, good, float(np.log(right + wrong + TINY).sum()))

@@ -1,11 +1,10 @@
 """The same road twice: recall and false loops of places, errors of localisation, what closing a loop brings.
 
-    python -m perf loops [--output FILE.json] [--part recorded|town|loop|alike|scale|gnss|size ...]
+    python -m perf loops [--output FILE.json] [--part recorded|town|loop|alike|scale|gnss|size ...] [--run DIR ...]
 
-`recorded`: two passes of one KITTI street in each other's map, three other streets against both. `town`: rendered once
-into --drives (extra `train`), driven twice, then otherwise. `loop`: corners without images, twice. `alike`: equal
-houses: each loop is false. `scale`: a unit of length that drifts. `gnss`: fixes that jump. `size`: simulated
-descriptors of 1, 10, 100 km.
+`recorded`: two passes of a KITTI street in each other's map, other streets in both. `town`: rendered into --drives,
+driven twice, then otherwise. `loop`, `alike`: corners without images, equal houses. `scale`: a unit of length that
+drifts. `gnss`: fixes that jump. `size`: simulated descriptors. `--run`: what `birdslam run --gnss` left in DIR.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from birdslam.loops.map_pose import MapState
 from birdslam.loops.place_map import MapCamera, PlaceMap
 from birdslam.loops.session import MapSession
 from birdslam.outputs.map_trajectory import MapTrajectory
-from birdslam.perf.maps import scale_drift, simulated, town
+from birdslam.perf.maps import on_earth, scale_drift, simulated, town
 from birdslam.perf.maps.estimates import Seen, estimated
 from birdslam.perf.reporting.arguments import add_data, benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
@@ -51,9 +50,14 @@ def run(arguments: list[str]) -> None:
     parser.add_argument("--drives", type=Path, default=Path("out/town"), metavar="DIR", help="of the rendered town")
     parser.add_argument("--way", type=float, default=2000.0, metavar="M", help="of the simulated loop")
     parser.add_argument("--equal-houses", type=float, default=5000.0, metavar="M", help="of each look-alike street")
+    parser.add_argument("--run", type=Path, nargs="+", metavar="DIR", help="on Earth: what runs with --gnss left there")
     options = parser.parse_args(arguments)
     cv2.setNumThreads(1)
     with Ledger(options.output, label, features=[str(kind) for kind in options.features], way_m=options.way) as ledger:
+        for folder in options.run or ():
+            on_earth.measure(ledger, folder)
+        if options.run:
+            return
         if "recorded" in options.part:
             recorded(ledger, options.data, [FeatureKind(kind) for kind in options.features])
         if "town" in options.part:

@@ -24,11 +24,13 @@ from birdslam.loops.map_pose import MapState
 from birdslam.loops.place_map import MapCamera, PlaceMap
 from birdslam.loops.session import MapSession
 from birdslam.outputs.placed import Place
+from birdslam.perf.maps import indices
 from birdslam.perf.reporting.figures import Ledger
 from birdslam.runtime.maps.drive_earth import write_earth
 from birdslam.types import NS_PER_S, Attitude
 
 LENGTHS_KM = 1, 10, 100
+COMPARED_KM = 10  # up to which other indices are looked at too
 LOOK_UPS = 20
 ORIGIN, FIX_M = (51.05, -114.05), 2.5
 LEG_M, CORNER_M = 400, 19  # of the winding street of equal houses: straight on, and each of two corners of 12 m radius
@@ -55,6 +57,10 @@ def loop(ledger: Ledger, way_m: float) -> None:
     open_m = max(_apart(truth[each.t_source_ns], odometry[each.t_source_ns]) for each in place_map.keyframes)
     closed_m = max(_apart(truth[each.t_source_ns], each.T_map_keyframe) for each in place_map.keyframes)
     # Scale is no loop's to find: the frame is the first drive's, whose metres are off by a share of the way
+    at = np.array([(k.T_map_keyframe.x_m, k.T_map_keyframe.y_m) for k in place_map.keyframes])
+    true = np.array([(truth[k.t_source_ns].x_m, truth[k.t_source_ns].y_m) for k in place_map.keyframes])
+    scale = float((at * true).sum() / (at**2).sum())
+    unscaled_m = float(np.hypot(*(scale * at - true).T).max())
     end_m = _apart(T_true, last.T_map_ego or T_odom)
     row: dict[str, Any] = {
         "way_m": 2 * around,
@@ -62,11 +68,14 @@ def loop(ledger: Ledger, way_m: float) -> None:
         "end_in_the_map_m": round(end_m, 3),
         "worst_keyframe_by_odometry_m": round(open_m, 3),
         "worst_keyframe_in_the_map_m": round(closed_m, 3),
+        "true_metres_over_the_maps": round(scale, 5),
+        "worst_keyframe_by_true_metres_m": round(unscaled_m, 3),
         "loops": sum(link.loop for link in place_map.links),
     }
     text = (
         f"end {before_m:.2f} m off by odometry ({before_m / around * 50.0:.2f} % of the way), {end_m:.2f} m in the map "
-        f"({end_m / around * 50.0:.2f} %); worst keyframe {open_m:.2f} m off by odometry, {closed_m:.2f} m in the map"
+        f"({end_m / around * 50.0:.2f} %); worst keyframe {open_m:.2f} m off by odometry, {closed_m:.2f} m in the map, "
+        f"{unscaled_m:.2f} m with its metres times {scale:.4f}"
     )
     ledger.add(f"loop of {around} m, twice", text, **row, text=text)
     kept = encode_map(place_map)
@@ -196,7 +205,7 @@ def size(ledger: Ledger) -> None:
         index = place_map.index()
         index.look_up(place_map.keyframes[0].descriptors, 6)
         built_s = time.process_time() - begun
-        took_ms, right = [], 0
+        took_ms, right, views, where = [], 0, [], []
         for number in range(0, count, max(1, count // LOOK_UPS)):
             own = place_map.keyframes[number].descriptors
             seen = own ^ np.packbits(chance.random((MOST_POINTS, 8 * DESCRIPTOR_BYTES)) < SAME_BITS, axis=1)
@@ -204,6 +213,8 @@ def size(ledger: Ledger) -> None:
             found = index.look_up(seen, 6)
             took_ms.append(1e3 * (time.process_time() - begun))
             right += number in found
+            views.append(seen)
+            where.append({number})
         data = len(encode_map(place_map))
         p50_ms, worst_ms = float(np.median(took_ms)), max(took_ms)
         text = (
@@ -219,3 +230,5 @@ def size(ledger: Ledger) -> None:
             look_up_ms=[round(each, 3) for each in took_ms],
             built_s=round(built_s, 2),
         )
+        if length_km <= COMPARED_KM:
+            indices.compare(ledger, f"map of {length_km} km", place_map, views, where)

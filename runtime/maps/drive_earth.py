@@ -111,7 +111,7 @@ def figures(earth: Earth, camera: Camera) -> dict[str, Any]:
         "scale_to_gnss": round(earth.scale, 5),
         "sigma_scale": round(float(np.sqrt(earth.cov[3, 3])), 5),
         "speed_ratio": None if earth.speed_ratio is None else round(earth.speed_ratio, 4),
-        "height_hint": earth.height_hint(camera.height_m),
+        "hint": earth.calibration_hint(camera),
     }
 
 
@@ -122,6 +122,6 @@ def rows(found: dict[str, Any]) -> list[tuple[str, str]]:
     ratio = "" if found["speed_ratio"] is None else f", speed over theirs {found['speed_ratio']:.3f}"
     sigma = 100.0 * found["sigma_scale"]
     out.append(("  metres", f"GNSS over ours {found['scale_to_gnss']:.3f} +- {sigma:.1f} %{ratio}"))
-    if found["height_hint"]:
-        out.append(("  hint", found["height_hint"]))
+    if found["hint"]:
+        out.append(("  hint", found["hint"]))
     return out

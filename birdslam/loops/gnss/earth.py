@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 
 from birdslam.geometry.arrays import Floats, Ints
+from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2, wrap
 from birdslam.loops.map_pose import EarthPose
 from birdslam.types import NS_PER_S
@@ -24,8 +25,10 @@ DELAYS_S = np.arange(-2.0, 2.01, 0.1)
 DELAY_SIGMA_S = 0.5
 WINDOW_S, MOST_WINDOWS = 60.0, 10  # in which fixes are compared with odometry for their delay
 ITERATIONS, WINDOW_ITERATIONS = 30, 16
+SCALE_SIGMA = 0.1  # of the scale's logarithm, by the camera's file
+SPEED_SIGMA = 0.01  # of all speeds of a drive together, which receivers smooth
 DEFAULT_SIGMA_M = 5.0  # of a fix that does not say its own
-HINT_SIGMAS, HINT_REL = 3.0, 0.02  # a wrong height is reported where it is that sure, and that large
+HINT_SIGMAS, HINT_REL = 3.0, 0.02  # a wrong height, or view, is reported where it is that sure, and that large
 
 
 class GnssFix(msgspec.Struct, frozen=True, kw_only=True):
@@ -64,6 +67,7 @@ class Earth:
     rms_m: float  # of the inliers
     speed_ratio: float | None  # of the drive's speed over the fixes' own, the median; None: they have none
     late_m: float = 0.0  # 1-sigma by which the delay, as far as it is not known, puts all places off
+    log_scale: tuple[float, float] = (0.0, SCALE_SIGMA)  # of what is known beside the places, with its 1-sigma
 
     def with_cov(self, cov: Floats) -> Earth:
         """`cov` (4, 4) is that of the fixes alone."""
@@ -120,15 +124,27 @@ class Earth:
             yaw_sigma_rad=math.sqrt(self.cov[2, 2] + cov[2, 2]),
         )
 
-    def height_hint(self, height_m: float) -> str:
-        """What the metres of the fixes say of the camera's height; "" where they say nothing against it."""
+    def calibration_hint(self, camera: Camera) -> str:
+        """What the metres of the fixes say of the camera's file; "" where they say nothing against it.
+
+        Our metres are in proportion to the height, and about to the focal length: a straight way can't tell which.
+        """
         sigma = math.sqrt(self.cov[3, 3])
         if abs(math.log(self.scale)) < max(HINT_SIGMAS * sigma, HINT_REL):
             return ""
+        height_m = camera.height_m
+        now_deg, fits_deg = (_view_deg(camera, scale) for scale in (1.0, self.scale))
         return (
             f"camera height {height_m * self.scale:.2f} m instead of {height_m:.2f} m fits GNSS "
-            f"(within {height_m * self.scale * 2.0 * sigma:.2f} m)"
+            f"(within {height_m * self.scale * 2.0 * sigma:.2f} m); or, if the height was measured, a view of "
+            f"{fits_deg:.0f} degrees across instead of {now_deg:.0f}"
         )
+
+
+def _view_deg(camera: Camera, scale: float) -> float:
+    """Across, by a focal length so many times the camera's; its distortion left out, as where a view is stated."""
+    half = 0.5 * camera.width_px / (scale * camera.fx_px)
+    return 2.0 * math.degrees(half if camera.fisheye else math.atan(half))
 
 
 def place_on_earth(t_ns: Ints, poses: list[SE2], fixes: list[GnssFix]) -> Earth:
@@ -151,7 +167,9 @@ def place_on_earth(t_ns: Ints, poses: list[SE2], fixes: list[GnssFix]) -> Earth:
     if inside.sum() < LEAST_FIXES:
         raise EarthError(f"{len(fixes)} fixes, and fewer than {LEAST_FIXES} of them within the drive's time")
     here = np.column_stack([np.interp(at[inside], seconds, column) for column in xy.T])
-    parameters, cov, chi2 = fit(here, enu[inside], sigma[inside])
+    ratios = _speed_ratios(seconds, xy, times - delay_s, fixes)
+    log_scale = _log_scale(ratios)
+    parameters, cov, chi2 = fit(here, enu[inside], sigma[inside], log_scale=log_scale)
     way_m = float(np.linalg.norm(np.ptp(here, axis=0)))
     if way_m < LEAST_WAY_M:
         raise EarthError(f"the drive goes {way_m:.0f} m between its fixes: {LEAST_WAY_M:g} m are needed for a heading")
@@ -170,8 +188,9 @@ def place_on_earth(t_ns: Ints, poses: list[SE2], fixes: list[GnssFix]) -> Earth:
         int(inside.sum()),
         int((~good).sum()),
         float(np.sqrt((error_m**2).mean())),
-        _speed_ratio(seconds, xy, times - delay_s, fixes),
+        float(np.median(ratios)) if ratios else None,
         late_m,
+        log_scale,
     ).with_cov(cov)
 
 
@@ -204,20 +223,28 @@ def _delay(seconds: Floats, xy: Floats, times: Floats, enu: Floats, sigma: Float
     return mean_s, math.sqrt(float(weight @ (DELAYS_S - mean_s) ** 2 / weight.sum()))
 
 
-def fit(xy: Floats, enu: Floats, sigma: Floats, iterations: int = ITERATIONS) -> tuple[Floats, Floats, Floats]:
+def fit(
+    xy: Floats,
+    enu: Floats,
+    sigma: Floats,
+    iterations: int = ITERATIONS,
+    log_scale: tuple[float, float] = (0.0, SCALE_SIGMA),
+) -> tuple[Floats, Floats, Floats]:
     """(east, north, yaw, log scale), their covariance, and each fix's chi-square; Gauss-Newton with Cauchy weights.
 
+    `log_scale`: what is known of it beforehand, with its 1-sigma.
     The start is a line through a robust pair of distant medians: Umeyama's closed form (1991) on all.
     """
     centre, there = np.median(xy, axis=0), np.median(enu, axis=0)
     a, b = xy - centre, enu - there
     turned = complex((a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1]).sum(), (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum())
-    yaw, log_scale = math.atan2(turned.imag, turned.real), 0.0
+    known, by = log_scale[0], log_scale[1] ** -2
+    yaw, log_scale_now = math.atan2(turned.imag, turned.real), known
     shift = there.copy()
     H: Floats = np.eye(4)
     chi2: Floats = np.zeros(len(xy))
     for iteration in range(iterations):
-        c, s, scale = math.cos(yaw), math.sin(yaw), math.exp(log_scale)
+        c, s, scale = math.cos(yaw), math.sin(yaw), math.exp(log_scale_now)
         rotated = a @ np.array([[c, s], [-s, c]]) * scale
         error = enu - rotated - shift
         chi2 = (error**2).sum(axis=1) / sigma**2
@@ -227,20 +254,20 @@ def fit(xy: Floats, enu: Floats, sigma: Floats, iterations: int = ITERATIONS) ->
         J[:, 0, 2], J[:, 1, 2] = -rotated[:, 1], rotated[:, 0]
         J[:, :, 3] = rotated
         H = np.einsum("nai,n,naj->ij", J, weight, J)
-        H[3, 3] += 0.1**-2  # the scale is within a tenth, 1-sigma
+        H[3, 3] += by
         g = np.einsum("nai,n,na->i", J, weight, error)
-        g[3] -= log_scale * 0.1**-2
+        g[3] -= (log_scale_now - known) * by
         step = np.linalg.solve(H + 1e-9 * np.eye(4), g)
-        shift, yaw, log_scale = shift + step[:2], yaw + float(np.clip(step[2], -0.5, 0.5)), log_scale + float(step[3])
-        log_scale = float(np.clip(log_scale, -0.7, 0.7))
-    c, s, scale = math.cos(yaw), math.sin(yaw), math.exp(log_scale)
+        shift, yaw = shift + step[:2], yaw + float(np.clip(step[2], -0.5, 0.5))
+        log_scale_now = float(np.clip(log_scale_now + step[3], -0.7, 0.7))
+    c, s, scale = math.cos(yaw), math.sin(yaw), math.exp(log_scale_now)
     moved = shift - scale * (centre @ np.array([[c, s], [-s, c]]))
     cov: Floats = np.linalg.inv(H + 1e-9 * np.eye(4)).astype(np.float64)
-    return np.array([*moved, yaw, log_scale]), cov, chi2
+    return np.array([*moved, yaw, log_scale_now]), cov, chi2
 
 
-def _speed_ratio(seconds: Floats, xy: Floats, at: Floats, fixes: list[GnssFix]) -> float | None:
-    """Over each second around a fix that tells its speed."""
+def _speed_ratios(seconds: Floats, xy: Floats, at: Floats, fixes: list[GnssFix]) -> list[float]:
+    """Of ours over theirs, in each second around a fix that tells its speed."""
     ratios = []
     for t, fix in zip(at, fixes, strict=True):
         if fix.speed_mps is None or fix.speed_mps < 3.0 or t - 0.5 < seconds[0] or t + 0.5 > seconds[-1]:
@@ -249,4 +276,16 @@ def _speed_ratio(seconds: Floats, xy: Floats, at: Floats, fixes: list[GnssFix]) 
         if inside.sum() > 1:
             way = np.hypot(*np.diff(xy[inside], axis=0).T).sum()
             ratios.append(float(way / (seconds[inside][-1] - seconds[inside][0]) / fix.speed_mps))
-    return float(np.median(ratios)) if ratios else None
+    return ratios
+
+
+def _log_scale(ratios: list[float]) -> tuple[float, float]:
+    """What the fixes' speeds, by their median, and the camera's file tell of the scale."""
+    by_file = SCALE_SIGMA**-2
+    if len(ratios) < LEAST_FIXES:
+        return 0.0, SCALE_SIGMA
+    logs = -np.log(ratios)
+    middle = float(np.median(logs))
+    sigma = 1.4826 * float(np.median(np.abs(logs - middle))) * math.sqrt(0.5 * math.pi / len(logs))  # of a median
+    by_speed = max(sigma, SPEED_SIGMA) ** -2
+    return middle * by_speed / (by_speed + by_file), (by_speed + by_file) ** -0.5

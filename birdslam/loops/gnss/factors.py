@@ -121,7 +121,8 @@ def _fitted(earth: Earth, poses: dict[int, Solved], fixed: dict[int, Fixed], num
     degrees = np.array([(fixed[number].latitude_deg, fixed[number].longitude_deg) for number in numbers])
     xy = np.array([(poses[number][0].x_m, poses[number][0].y_m) for number in numbers])
     enu = flat.xy(degrees)
-    parameters, cov, _ = fit(xy, enu, np.array([fixed[number].weighed_m for number in numbers]))
+    sigma_m = np.array([fixed[number].weighed_m for number in numbers])
+    parameters, cov, _ = fit(xy, enu, sigma_m, log_scale=earth.log_scale)
     found = replace(
         earth,
         east_m=float(parameters[0]),
