@@ -13,9 +13,8 @@ from collections.abc import Iterable
 
 SHORT_NS = 100_000  # the kernel's least
 _SETATTR = {"x86_64": 314, "aarch64": 274}  # sched_setattr's number
-_ATTRIBUTES = struct.Struct(
-    "=IIQiIQQQ"
-)  # size, policy, flags, nice, priority, runtime (here the slice), deadline, period
+# size, policy, flags, nice, priority, runtime (here the slice), deadline, period
+_ATTRIBUTES = struct.Struct("=IIQiIQQQ")
 
 
 def wake_soon(threads: Iterable[int], slice_ns: int = SHORT_NS) -> None:

@@ -21,10 +21,7 @@ from birdslam.perf.reporting.figures import Ledger
 
 Bytes = NDArray[np.uint8]
 LookUp = Callable[[Bytes], Sequence[int]]
-LISTS_PER_ROOT, PROBES = (
-    4,
-    8,
-)  # of the inverted file: faiss advises 4 to 16 roots of the number
+LISTS_PER_ROOT, PROBES = 4, 8  # of the inverted file: faiss advises 4 to 16 roots of the number
 
 
 def _indices(ours: PlaceIndex, descriptors: Sequence[Bytes]) -> Iterator[tuple[str, LookUp]]:
