@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-OF_A_RECORDING = ("stride", "speed", "odometry", "detections", "loop", "prefetch_frames")
+OF_A_RECORDING = ("stride", "speed", "odometry", "detections", "detector", "loop", "prefetch_frames")
 MCAP_HEAD_BYTES = 64  # the profile stands in the first record: "ros2" in a bag, "" in a recording of ours
 
 
