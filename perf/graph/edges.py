@@ -11,6 +11,7 @@ are no longer interpolated.
 from __future__ import annotations
 
 import math
+from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -276,8 +277,9 @@ def statistics_table(cases: Sequence[Case]) -> str:
     return markdown(["log", *(name.replace("_", " ") for name in fields)], lines)
 
 
-def run(arguments: list[str]) -> None:
-    parser = benchmark_parser("edges", label)
+def case_parser(name: str, what: str) -> ArgumentParser:
+    """Which cases: recorded logs, which a configuration made, and simulated drives."""
+    parser = benchmark_parser(name, what)
     add_data(parser)
     add_config(parser)
     parser.add_argument("--model", action="append", default=[], metavar="ROLE=PATH", help="that looks at the images")
@@ -285,11 +287,22 @@ def run(arguments: list[str]) -> None:
     parser.add_argument("--logs", type=Path, required=True, help="where recorded logs are kept")
     parser.add_argument("--clips", default=",".join(CLIPS), help="with images, a list; none where empty")
     parser.add_argument("--seeds", type=int, default=3, help="of each simulated drive")
-    options = parser.parse_args(arguments)
+    return parser
+
+
+def cases_of(options: Namespace, configuration: Configuration) -> tuple[list[Case], list[Case]]:
+    """Recorded ones, and simulated ones."""
+    clips = [clip for clip in options.clips.split(",") if clip]
+    return (
+        [recorded(clip, options.data, options.logs, configuration) for clip in clips],
+        [simulated(name, options.data, seed) for name in SIMULATED for seed in range(options.seeds)],
+    )
+
+
+def run(arguments: list[str]) -> None:
+    options = case_parser("edges", label).parse_args(arguments)
     output, options.output = options.output, None  # of the benchmark, not of a drive
-    configuration = configuration_of(options)
-    cases = [recorded(clip, options.data, options.logs, configuration) for clip in options.clips.split(",") if clip]
-    drives = [simulated(name, options.data, seed) for name in SIMULATED for seed in range(options.seeds)]
+    cases, drives = cases_of(options, configuration_of(options))
     for case in cases:
         kinds = [edge.kind for m in case.log for edge in m.cp]
         lanes = sum(kind is LandmarkKind.LANE_STATION for kind in kinds)

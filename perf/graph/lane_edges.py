@@ -18,7 +18,7 @@ import numpy as np
 
 from birdslam.bench.figures import markdown
 from birdslam.bench.tracking.benchmark import Truth, ours
-from birdslam.perf.graph.edges import CLIPS, SIMULATED, Case, Variant, grade, log_of, recorded, simulated
+from birdslam.perf.graph.edges import Case, Variant, case_parser, cases_of, grade, log_of
 from birdslam.perf.graph.lane_curves import (
     EgoOnLines,
     SeenCurve,
@@ -28,15 +28,14 @@ from birdslam.perf.graph.lane_curves import (
     seen_curves,
     vehicles_in_lanes,
 )
-from birdslam.perf.reporting.arguments import add_data, benchmark_parser
 from birdslam.perf.reporting.figures import write_json
-from birdslam.runtime.cli.arguments import add_config, add_settings
 from birdslam.runtime.configuration import Configuration
 from birdslam.runtime.options import configuration_of
 from birdslam.slam import SlamConfig
-from birdslam.sources.shipped_drive import DemoRecording, TrueBody
+from birdslam.sources.shipped_drive import DemoRecording
 from birdslam.trajectory import as_poses, inverse, mount_pose, split_pose
 from birdslam.types import Measurements
+from birdslam.vehicles.placement.localisation import iou
 
 label = "what lane lines as curves are worth in the graph, and the most that they could be"
 
@@ -81,34 +80,24 @@ def rendered(folder: Path, logs: Path, configuration: Configuration) -> Case:
         for body in bodies:
             truth.vehicles.setdefault(body.body, {})[m.frame_id] = ego[m.frame_id] @ body.T_ego_body
             truth.kinds[body.body] = body.label
+        overlap = iou(np.array([body.box_px for body in bodies]), np.array([edge.box_px for edge in m.cv]))
         truth.matches[m.frame_id] = {
-            body.body: edge.vehicle for body in bodies for edge in m.cv if _iou(body, edge.box_px) > LEAST_OVERLAP
+            body.body: edge.vehicle
+            for body, row in zip(bodies, overlap, strict=True)
+            for edge, shared in zip(m.cv, row, strict=True)
+            if shared > LEAST_OVERLAP
         }
     return Case(folder.name, log, ego, truth)
 
 
-def _iou(body: TrueBody, box_px: Sequence[float]) -> float:
-    a, b = np.array(body.box_px), np.array(box_px)
-    both = np.prod(np.clip(np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2]), 0.0, None))
-    return float(both / max(np.prod(a[2:] - a[:2]) + np.prod(b[2:] - b[:2]) - both, 1e-9))
-
-
 def run(arguments: list[str]) -> None:
-    parser = benchmark_parser("lane_edges", label)
-    add_data(parser)
-    add_config(parser)
-    parser.add_argument("--model", action="append", default=[], metavar="ROLE=PATH", help="that looks at the images")
-    add_settings(parser)
-    parser.add_argument("--logs", type=Path, required=True, help="where recorded logs are kept")
-    parser.add_argument("--clips", default=",".join(CLIPS), help="with images, a list; none where empty")
-    parser.add_argument("--seeds", type=int, default=3, help="of each simulated drive")
+    parser = case_parser("lane_edges", label)
     parser.add_argument("--rendered", type=Path, nargs="*", default=[], metavar="DIR", help="drives of `perf roads`")
     options = parser.parse_args(arguments)
     output, options.output = options.output, None  # of the benchmark, not of a drive
     configuration = configuration_of(options)
-    cases = [recorded(clip, options.data, options.logs, configuration) for clip in options.clips.split(",") if clip]
-    cases += [rendered(folder, options.logs, configuration) for folder in options.rendered]
-    cases += [simulated(name, options.data, seed) for name in SIMULATED for seed in range(options.seeds)]
+    seen, drives = cases_of(options, configuration)
+    cases = [*seen, *(rendered(folder, options.logs, configuration) for folder in options.rendered), *drives]
     grades: dict[str, dict[str, dict[str, float]]] = {}
     for case in cases:
         for name, variant in variants(case).items():
