@@ -42,6 +42,8 @@ class PeopleTrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
     confirm_hits: int = 2  # a track gets its id when it has been seen so often
     forget_unconfirmed_s: float = 0.25  # without a box, of who has no id yet
     forget_s: float = 1.5  # without a box, of who has an id
+    seen_for_s: float = 1.2  # on average, until a detector finds somebody no more: hidden, or missed
+    unseen_for_s: float = 0.7  # and until it does again
     most: int = 60  # who is followed at once: the nearest
     boxes: PeopleBoxesConfig = PeopleBoxesConfig()  # how sure boxes are
     people: PeopleConfig = PeopleConfig()  # how people are and move
@@ -97,7 +99,7 @@ class PeopleTracker:
         self.frame = frame
         if detections is not None:
             boxes = people_boxes(detections, self.camera, ground, self.config.boxes)
-            pairs = self._associate(boxes, ego.T_world_ego, ground.height_m)
+            pairs = self._associate(boxes, ego.T_world_ego, ground.height_m, frame.dt_s)
             rows = [row for row, _ in pairs]
             self.filter.correct(rows, [boxes[k] for _, k in pairs], ego.T_world_ego, ground.height_m)
             for row, k in pairs:
@@ -116,11 +118,14 @@ class PeopleTracker:
         ego_mps = UNKNOWN_MPS if frame.travelled_m is None else frame.travelled_m / max(frame.dt_s, 1e-3)
         self.filter.predict(frame.dt_s, ego.T_world_ego, ego.step_cov, shift_rad, ego_mps, road.sigma_pitch_rad)
 
-    def _associate(self, boxes: Sequence[PersonBox], T_world_ego: SE2, height_m: float) -> list[tuple[int, int]]:
+    def _associate(
+        self, boxes: Sequence[PersonBox], T_world_ego: SE2, height_m: float, dt_s: float
+    ) -> list[tuple[int, int]]:
         """(row, box): the assignment of least total cost, the negative log-likelihood within the gate."""
         if not boxes or not self.tracks:
             return []
         squared, costs = self.filter.distances(boxes, T_world_ego, height_m)
+        costs += self._of_sight(dt_s)[:, None] + self._of_class(boxes)
         cost = np.where(squared <= self.config.gate, costs, NEVER)
         births = np.where(np.eye(len(boxes)), NEW, NEVER)  # a row of somebody new for each box
         rows, columns = self._assign(np.vstack([cost, births]))
@@ -128,6 +133,23 @@ class PeopleTracker:
         return [
             (int(i), int(j)) for i, j in zip(rows, columns, strict=True) if i < known and cost[i, j] < NEVER
         ]  # fmt: skip
+
+    def _of_sight(self, dt_s: float) -> Floats:
+        """(N,): -2 log of the odds that each has a box: who was seen in the last frame is seen again, who was not is
+        hidden still (a Markov chain of two states), and takes nobody else's box.
+        """
+        lost = -math.expm1(-dt_s / self.config.seen_for_s)
+        found = -math.expm1(-dt_s / self.config.unseen_for_s)
+        last = max(track.seen_frame for track in self.tracks)
+        seen = np.where([track.seen_frame == last for track in self.tracks], 1.0 - lost, found)
+        return np.asarray(-2.0 * np.log(seen / (1.0 - seen)))
+
+    def _of_class(self, boxes: Sequence[PersonBox]) -> Floats:
+        """(N, M): -2 log of the probability of each box's class, by the classes that somebody had so far."""
+        rides = np.array([box.label != PEDESTRIAN for box in boxes])
+        walked = np.array([track.votes[PEDESTRIAN] for track in self.tracks])[:, None]
+        ridden = np.array([track.votes.total() for track in self.tracks])[:, None] - walked
+        return np.asarray(-2.0 * np.log((np.where(rides, ridden, walked) + 1.0) / (walked + ridden + 2.0)))
 
     def _begin(self, boxes: list[PersonBox], matched: set[int], frame: OpenFrame, height_m: float) -> None:
         followed = np.array([boxes[k].box_px for k in matched]).reshape(-1, 4)
