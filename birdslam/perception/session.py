@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+
 import onnxruntime as ort
 from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
 
@@ -18,6 +21,7 @@ EXECUTION_PROVIDERS = {  # of the configuration -> of onnxruntime; the packages 
     "cuda": "CUDAExecutionProvider",
     "tensorrt": "TensorrtExecutionProvider",
 }
+_NVIDIA = frozenset({"cuda", "tensorrt"})
 _FLOAT32 = "tensor(float)"
 
 
@@ -54,6 +58,15 @@ def _options_of(provider: str, threads: int) -> dict[str, str]:
     if provider != "openvino":
         return {}
     return {"device_type": "CPU", "num_of_threads": str(threads), "precision": "FP32"}
+
+
+def _nvidia_libraries() -> str:
+    """Loads CUDA's and cuDNN's libraries from where pip put them; what went wrong, as onnxruntime prints it, or ""."""
+    if not hasattr(ort, "preload_dlls"):  # before 1.21: the loader's own path then
+        return ""
+    with contextlib.redirect_stdout(io.StringIO()) as said:
+        ort.preload_dlls()
+    return " ".join(said.getvalue().split())
 
 
 def plain_session(content: bytes, threads: int) -> ort.InferenceSession:
@@ -101,10 +114,11 @@ def open_session(
     if provider not in providers_here():
         raise ProviderMissing(f"this onnxruntime has no {provider}, but {', '.join(providers_here())}")
     wanted = EXECUTION_PROVIDERS[provider]
+    missing = _nvidia_libraries() if provider in _NVIDIA else ""
     try:
         session = ort.InferenceSession(whole, options, providers=[(wanted, _options_of(provider, threads)), CPU])
     except SESSION_ERRORS as error:
         raise ProviderMissing(f"{provider} does not begin: {error}") from error
     if session.get_providers()[0] != wanted:  # onnxruntime goes to the CPU by itself
-        raise ProviderMissing(f"{provider} does not begin on this computer")
+        raise ProviderMissing(f"{provider} does not begin on this computer{missing and ': ' + missing}")
     return session
