@@ -21,6 +21,7 @@ EXECUTION_PROVIDERS = {  # of the configuration -> of onnxruntime; the packages 
     "cuda": "CUDAExecutionProvider",
     "tensorrt": "TensorrtExecutionProvider",
 }
+_QUIET = 4  # what goes wrong is raised; onnxruntime's logger would write it to the terminal too
 _NVIDIA = frozenset({"cuda", "tensorrt"})
 _FLOAT32 = "tensor(float)"
 
@@ -35,7 +36,7 @@ def session_options(threads: int) -> ort.SessionOptions:
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.add_session_config_entry("session.inter_op.allow_spinning", "0")
     options.enable_mem_pattern = False  # as fast without, and 10 of 29 MB less for the shipped network
-    options.log_severity_level = 4  # what goes wrong is raised; its logger would write it to the terminal too
+    options.log_severity_level = _QUIET
     return options
 
 
@@ -115,8 +116,10 @@ def open_session(
         raise ProviderMissing(f"this onnxruntime has no {provider}, but {', '.join(providers_here())}")
     wanted = EXECUTION_PROVIDERS[provider]
     missing = _nvidia_libraries() if provider in _NVIDIA else ""
+    ort.set_default_logger_severity(_QUIET)
+    providers = [(wanted, _options_of(provider, threads)), CPU]
     try:
-        session = ort.InferenceSession(whole, options, providers=[(wanted, _options_of(provider, threads)), CPU])
+        session = ort.InferenceSession(whole, options, providers=providers, enable_fallback=0)
     except SESSION_ERRORS as error:
         raise ProviderMissing(f"{provider} does not begin: {error}") from error
     if session.get_providers()[0] != wanted:  # onnxruntime goes to the CPU by itself
