@@ -120,7 +120,7 @@ def open_session(
     providers = [(wanted, _options_of(provider, threads)), CPU]
     try:
         session = ort.InferenceSession(whole, options, providers=providers, enable_fallback=0)
-    except SESSION_ERRORS as error:
+    except (*SESSION_ERRORS, RuntimeError) as error:  # RuntimeError: TensorRT's libraries are not there
         raise ProviderMissing(f"{provider} does not begin: {error}") from error
     if session.get_providers()[0] != wanted:  # onnxruntime goes to the CPU by itself
         raise ProviderMissing(f"{provider} does not begin on this computer{missing and ': ' + missing}")
