@@ -184,3 +184,22 @@ def test_the_page_has_a_row_for_each_network_and_provider(tmp_path: Path, monkey
     assert "absent" not in text
     with pytest.raises(PerfError, match="no/such/package: pip does not install it"):
         perf_providers.measure("all", tmp_path, {}, 2, None, "./no/such/package", "label")
+
+
+@stand_in
+def test_an_accelerator_whose_libraries_are_missing_gives_way_to_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As TensorRT does without its own: a RuntimeError of another kind than a session's."""
+    begin = session.ort.InferenceSession
+
+    def without_libraries(content: bytes, options: Any, providers: list[Any], **more: Any) -> Any:
+        if providers != [session.CPU]:
+            raise RuntimeError("Please install TensorRT libraries")
+        return begin(content, options, providers=providers, **more)
+
+    monkeypatch.setitem(session.EXECUTION_PROVIDERS, "tensorrt", session.CPU)
+    monkeypatch.setattr(session.ort, "InferenceSession", without_libraries)
+    fallen = load_network("multitask", by("tensorrt"))
+    assert (fallen.provider, fallen.fell_back) == (
+        "cpu",
+        "tensorrt: tensorrt does not begin: Please install TensorRT libraries",
+    )

@@ -11,7 +11,7 @@ from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
 from birdslam.perception.manifest import Input, ManifestMismatch
 from birdslam.perception.onnx_files.subnormal import without_tiny_weights
 
-SESSION_ERRORS = tuple(
+SESSION_ERRORS: tuple[type[Exception], ...] = tuple(
     error for error in vars(ort_errors).values() if isinstance(error, type) and issubclass(error, Exception)
 )
 CPU = "CPUExecutionProvider"

@@ -25,7 +25,7 @@ from birdslam.outputs.plain_words import LengthsBy
 from birdslam.outputs.report.page import REPORT
 from birdslam.perception import ModelError, load_network
 from birdslam.perception.pointnet import load_pointnet
-from birdslam.runtime.configuration import Configuration, ConfigurationError, ModelsConfig, complete
+from birdslam.runtime.configuration import Configuration, ConfigurationError, complete
 from birdslam.runtime.environment import INTERRUPTED_STATUS
 from birdslam.runtime.nodes.sources import RecordedSource, open_source
 from birdslam.runtime.process import realtime
