@@ -14,6 +14,7 @@ from birdslam.perception.onnx_files.subnormal import without_tiny_weights
 SESSION_ERRORS: tuple[type[Exception], ...] = tuple(
     error for error in vars(ort_errors).values() if isinstance(error, type) and issubclass(error, Exception)
 )
+_START_ERRORS: tuple[type[Exception], ...] = (*SESSION_ERRORS, RuntimeError)  # the last: without TensorRT's libraries
 CPU = "CPUExecutionProvider"
 EXECUTION_PROVIDERS = {  # of the configuration -> of onnxruntime; the packages that bring them: docs/networks.md
     "cpu": CPU,
@@ -120,7 +121,7 @@ def open_session(
     providers = [(wanted, _options_of(provider, threads)), CPU]
     try:
         session = ort.InferenceSession(whole, options, providers=providers, enable_fallback=0)
-    except (*SESSION_ERRORS, RuntimeError) as error:  # RuntimeError: TensorRT's libraries are not there
+    except _START_ERRORS as error:
         raise ProviderMissing(f"{provider} does not begin: {error}") from error
     if session.get_providers()[0] != wanted:  # onnxruntime goes to the CPU by itself
         raise ProviderMissing(f"{provider} does not begin on this computer{missing and ': ' + missing}")
