@@ -233,7 +233,7 @@ class LandmarkEdge(msgspec.Struct, frozen=True, kw_only=True, array_like=True, g
     kind: LandmarkKind = LandmarkKind.ROAD_POINT  # a feature on the road (0) or a station of a lane (1)
     # (2, 2), row-major: metres by which 1-sigma of the frame's pitch (first column) and of its height moves this and
     # all other landmarks of the frame together; None: it shares nothing
-    shared: tuple[float, float, float, float] | None = None
+    shared: Cov2 | None = None
 
     def __post_init__(self) -> None:
         cov = self.cov
