@@ -40,7 +40,6 @@ from birdslam.bench.tracking.reported import motion_row, range_rows, sights
 from birdslam.bench.tracking.tables import Published
 from birdslam.frontend import EgoMotion, FrontEndConfig, Pending
 from birdslam.graph.pose_graph import PoseGraph
-from birdslam.mapping.lane_mapper import LaneHead
 from birdslam.paper import PAPER as AS_PUBLISHED
 from birdslam.perception import ModelSpec, Perception, Ready
 from birdslam.runtime.configuration import Configuration, ConfigurationError, complete
@@ -267,7 +266,7 @@ def _log_maker(
 
     def make(seed: int, config: FrontEndConfig) -> list[Measurements]:
         perceive: Callable[[int, NDArray[np.uint8]], Pending] = given
-        frustum_network, lane_head = None, LaneHead()
+        frustum_network = lane_head = None
         if network:
             configuration = complete(job.configuration.as_lossless(), sequence.camera, KITTI_RATE_HZ)
             if config.pseudolidar.rule == "paper" and configuration.models.pointnet is None:  # Sec. 3.1.3

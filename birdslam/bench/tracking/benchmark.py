@@ -134,14 +134,14 @@ def make_log(
     config: FrontEndConfig,
     speeds: SpeedLog | None = None,
     frustum_network: FrustumNetwork | None = None,
-    lane_head: LaneHead = LaneHead(),  # noqa: B008
+    lane_head: LaneHead | None = None,
 ) -> list[Measurements]:
     """The front end's measurements of `frames`; frame ids are KITTI's.
 
     `images` gives a frame's image, None where it is unreadable; without `images` the odometry needs none. `speeds` are
     the car's own, by the frames' time from 0 on. `frustum_network` and `lane_head` are those of `FrontEnd`.
     """
-    frontend, log = FrontEnd(sequence.camera, config, odometry, frustum_network, lane_head), []
+    frontend, log = FrontEnd(sequence.camera, config, odometry, frustum_network, lane_head or LaneHead()), []
     for index in frames:
         image = NO_IMAGE if images is None else images(index)
         t_ns = round(index / KITTI_RATE_HZ * NS_PER_S)
