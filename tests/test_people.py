@@ -105,6 +105,13 @@ def test_a_rider_and_the_bicycle_are_one_and_a_motorcycles_rider_is_no_pedestria
     assert sorted(observed([person, beside, mount], ["person", "person", "bicycle"])) == ["cyclist", "pedestrian"]
 
 
+def test_a_cyclists_rider_is_one_with_it_and_who_stands_before_a_cyclist_is_not() -> None:
+    cyclist = (449.0, 124.0, 474.0, 185.0)
+    assert observed([cyclist, (451.0, 124.0, 472.0, 178.0)], ["cyclist", "person"]) == ["cyclist"]
+    before = (455.0, 126.0, 478.0, 197.0)
+    assert sorted(observed([cyclist, before], ["cyclist", "person"])) == ["cyclist", "pedestrian"]
+
+
 def test_who_sits_in_a_car_is_no_pedestrian_and_who_stands_before_or_behind_it_is() -> None:
     car = (500.0, 160.0, 700.0, 280.0)
     assert observed([car, (560.0, 170.0, 600.0, 220.0)], ["car", "person"]) == []
@@ -278,6 +285,23 @@ def test_people_whose_boxes_overlap_by_half_stay_apart_and_cross_with_their_ids(
     for _ in range(10):
         people = pair.see(found([box_of(10.0, 0.0), box_of(10.0, 0.3)]))
     assert len({p.person for p in people}) == 2
+
+
+@pytest.mark.parametrize(
+    ("label", "widths_m", "hidden"), [("person", (0.6, 0.6), 3), ("cyclist", (0.6, 0.6), 0), ("person", (0.4, 0.9), 0)]
+)
+def test_who_is_hidden_takes_not_the_box_of_a_neighbour_that_steps_in_front(
+    label: str, widths_m: tuple[float, float], hidden: int
+) -> None:
+    """Known by having been unseen for some frames, by the class, by the shape: the box is nearer to the hidden one."""
+    scene = Scene()
+    for _ in range(10):
+        both = [box_of(11.5, y_m, width_m=w_m) for y_m, w_m in zip((0.0, 0.5), widths_m, strict=True)]
+        told = scene.see(found(both, ["person", label]))
+    neighbour = max(told, key=lambda person: person.y_m)
+    for y_m in (*[0.5] * hidden, 0.2):
+        told = scene.see(found([box_of(11.5, y_m, width_m=widths_m[1])], [label]))
+    assert [person.person for person in told if person.age_ns == 0] == [neighbour.person]
 
 
 def test_frames_that_nobody_looked_at_cost_nothing_but_certainty() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -72,6 +73,41 @@ def test_an_accelerator_that_fails_on_the_way_gives_way_to_the_cpu(monkeypatch: 
     monkeypatch.setattr(_Bound, "infer", infer)
     for name, tensor in cpu.answer(IMAGE).items():
         assert np.array_equal(tensor, network.answer(IMAGE)[name])
+
+
+class CopiesWhenBound:
+    """A session and its binding as an accelerator's are: the input is copied when it is bound, not when it runs."""
+
+    def run(self, _outputs: Any, inputs: dict[str, np.ndarray]) -> list[np.ndarray]:
+        return [2.0 * image for image in inputs.values()]
+
+    def io_binding(self) -> CopiesWhenBound:
+        return self
+
+    def bind_input(self, _name: str, _device: str, _id: int, _kind: Any, shape: tuple[int, ...], place: int) -> None:
+        self._input = self._at(place, shape).copy()
+
+    def bind_output(self, _name: str, _device: str, _id: int, _kind: Any, shape: tuple[int, ...], place: int) -> None:
+        self._output = self._at(place, shape)
+
+    def run_with_iobinding(self, _binding: CopiesWhenBound) -> None:
+        self._output[:] = 2.0 * self._input
+
+    def synchronize_outputs(self) -> None:
+        """At once here."""
+
+    @staticmethod
+    def _at(place: int, shape: tuple[int, ...]) -> np.ndarray:
+        return np.ctypeslib.as_array(ctypes.cast(place, ctypes.POINTER(ctypes.c_float)), shape)
+
+
+def test_an_accelerator_sees_the_image_of_each_run() -> None:
+    image = np.zeros((1, 3, 4, 5), np.float32)
+    bound = _Bound(CopiesWhenBound(), "image", image, ["out"])
+    for value in (1.0, 2.0):
+        image[:] = value
+        assert bound.infer()
+        assert (bound.tensors["out"] == 2.0 * value).all()
 
 
 def figures(monkeypatch: pytest.MonkeyPatch, **found: Measured) -> list[Any]:
@@ -148,3 +184,22 @@ def test_the_page_has_a_row_for_each_network_and_provider(tmp_path: Path, monkey
     assert "absent" not in text
     with pytest.raises(PerfError, match="no/such/package: pip does not install it"):
         perf_providers.measure("all", tmp_path, {}, 2, None, "./no/such/package", "label")
+
+
+@stand_in
+def test_an_accelerator_whose_libraries_are_missing_gives_way_to_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As TensorRT does without its own: a RuntimeError of another kind than a session's."""
+    begin = session.ort.InferenceSession
+
+    def without_libraries(content: bytes, options: Any, providers: list[Any], **more: Any) -> Any:
+        if providers != [session.CPU]:
+            raise RuntimeError("Please install TensorRT libraries")
+        return begin(content, options, providers=providers, **more)
+
+    monkeypatch.setitem(session.EXECUTION_PROVIDERS, "tensorrt", session.CPU)
+    monkeypatch.setattr(session.ort, "InferenceSession", without_libraries)
+    fallen = load_network("multitask", by("tensorrt"))
+    assert (fallen.provider, fallen.fell_back) == (
+        "cpu",
+        "tensorrt: tensorrt does not begin: Please install TensorRT libraries",
+    )

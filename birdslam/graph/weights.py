@@ -79,7 +79,8 @@ def weighted(measurements: Measurements, config: WeightsConfig) -> Measurements:
     cc = measurements.cc
     if config.mode == "paper":
         cp_cov, vv_cov = effective_cov(config.cp, 2), effective_cov(config.vv, 3)  # Eq. 4, here and in the next lines
-        cp = tuple(replace(edge, cov=cp_cov) for edge in cp)
+        # Each CP edge counts alike, however many there are
+        cp = tuple(replace(edge, cov=cp_cov, shared=None) for edge in cp)
         cv = tuple(
             # What Eq. 4 says of an edge is all: of its size nothing
             replace(edge, cov=effective_cov(config.cv_at(edge.T_ego_vehicle.x_m), 3), sigma_log_height=0.0)

@@ -25,6 +25,7 @@ CARS = ("car", "van", "truck", "bus", "trailer")
 RIDER_COLUMNS = 0.5  # of the narrower of two boxes, that a rider and what is ridden share
 RIDER_FEET = 0.35  # of the bicycle's height: from its lower edge up to the feet of its rider, at the most
 RIDER_SIZES = (0.8, 2.6)  # a rider's box is so many times as high as the bicycle's
+RIDER_INSIDE, SAME_RIDER_IOU = 0.8, 0.5  # a rider's box lies so far in the cyclist's, and overlaps it so much
 OCCUPANT_INSIDE = 0.9  # of a person's box, inside that of a vehicle whose wheels are lower: somebody in it
 SAME_PERSON_IOU = 0.7  # of two boxes: the better score stays
 COVER_WIDTH = 0.3  # of a box's width: a nearer box that covers less of its lower edge hides no feet
@@ -112,9 +113,7 @@ def _joined(detections: Detections) -> tuple[Floats, list[str], list[bool], list
     bicycles, motorcycles = of(BICYCLE), of(MOTORCYCLE)
     people = _without_copies(of(PERSON))
     cyclists = _without_copies(of(CYCLIST))
-    if len(cyclists) and len(people):
-        people = people[iou(people[:, :4], cyclists[:, :4]).max(axis=1) < 0.5]
-    people = people[~_occupants(people, of(*CARS))]
+    people = people[~(_copies(people, cyclists) | _occupants(people, of(*CARS)))]
     mounts = np.vstack([bicycles, motorcycles])
     rider_of = _riders(people, mounts)
     rows, labels, whole, made_of = [], list[str](), list[bool](), list[tuple[int, ...]]()
@@ -153,6 +152,16 @@ def _without_copies(boxes: Floats) -> Floats:
         if not kept or overlap[row, kept].max() <= SAME_PERSON_IOU:
             kept.append(row)
     return boxes[kept]
+
+
+def _copies(people: Floats, cyclists: Floats) -> Bools:
+    """(N,): whose box is that of a cyclist's rider; who stands before one has feet or a side of its own."""
+    if not len(people) or not len(cyclists):
+        return np.zeros(len(people), dtype=np.bool_)
+    p, c = people[:, None, :4], cyclists[None, :, :4]
+    span = np.maximum(np.minimum(p[..., 2:], c[..., 2:]) - np.maximum(p[..., :2], c[..., :2]), 0.0)
+    inside = span.prod(axis=-1) > RIDER_INSIDE * np.prod(p[..., 2:] - p[..., :2], axis=-1)
+    return np.asarray((inside & (iou(people[:, :4], cyclists[:, :4]) >= SAME_RIDER_IOU)).any(axis=1))
 
 
 def _occupants(people: Floats, cars: Floats) -> Bools:

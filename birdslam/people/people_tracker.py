@@ -13,8 +13,9 @@ from dataclasses import dataclass, field
 import msgspec
 import numpy as np
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
-from birdslam.geometry.se2 import SE2
+from birdslam.people.box_model import MIN_SLOPE
 from birdslam.people.people_boxes import BICYCLE, CYCLIST, PEDESTRIAN, PeopleBoxesConfig, PersonBox, people_boxes
 from birdslam.people.people_config import PeopleConfig
 from birdslam.people.people_filter import PeopleFilter
@@ -30,6 +31,8 @@ SIDE_MARGIN = 0.03  # of the image's width: who is predicted farther outside has
 UNKNOWN_MPS = 10.0  # an ego of unknown motion is taken to drive
 LEAVES_S = 0.3  # until who left the image is forgotten
 
+SHAPE_DOF = 3.0  # of Student's t
+
 STANDS, WALKS = 0.7, 0.4  # probability of standing: hysteresis of what is reported
 
 
@@ -42,6 +45,12 @@ class PeopleTrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
     confirm_hits: int = 2  # a track gets its id when it has been seen so often
     forget_unconfirmed_s: float = 0.25  # without a box, of who has no id yet
     forget_s: float = 1.5  # without a box, of who has an id
+    seen_for_s: float = 1.1  # on average, until somebody has no box: hidden, or missed
+    hidden_for_s: float = 0.65  # and until one comes back
+    sigma_shape: float = 0.07  # of the log of a box's width over its height, from one box to the next
+    sigma_stride: float = 0.14  # and beside it, as arms and legs swing
+    stride_s: float = 1.0  # in so long
+    sigma_shapes: float = 0.17  # of the same from one person to another
     most: int = 60  # who is followed at once: the nearest
     boxes: PeopleBoxesConfig = PeopleBoxesConfig()  # how sure boxes are
     people: PeopleConfig = PeopleConfig()  # how people are and move
@@ -97,7 +106,7 @@ class PeopleTracker:
         self.frame = frame
         if detections is not None:
             boxes = people_boxes(detections, self.camera, ground, self.config.boxes)
-            pairs = self._associate(boxes, ego.T_world_ego, ground.height_m)
+            pairs = self._associate(boxes, frame, ground.height_m)
             rows = [row for row, _ in pairs]
             self.filter.correct(rows, [boxes[k] for _, k in pairs], ego.T_world_ego, ground.height_m)
             for row, k in pairs:
@@ -116,11 +125,12 @@ class PeopleTracker:
         ego_mps = UNKNOWN_MPS if frame.travelled_m is None else frame.travelled_m / max(frame.dt_s, 1e-3)
         self.filter.predict(frame.dt_s, ego.T_world_ego, ego.step_cov, shift_rad, ego_mps, road.sigma_pitch_rad)
 
-    def _associate(self, boxes: Sequence[PersonBox], T_world_ego: SE2, height_m: float) -> list[tuple[int, int]]:
-        """(row, box): the assignment of least total cost, the negative log-likelihood within the gate."""
+    def _associate(self, boxes: Sequence[PersonBox], frame: OpenFrame, height_m: float) -> list[tuple[int, int]]:
+        """(row, box): the assignment of least total cost, -2 log of the likelihood within the gate."""
         if not boxes or not self.tracks:
             return []
-        squared, costs = self.filter.distances(boxes, T_world_ego, height_m)
+        squared, costs = self.filter.distances(boxes, frame.ego.T_world_ego, height_m)
+        costs += self._sight(frame.dt_s) + self._classes(boxes) + self._shapes(boxes, frame.ego.t_source_ns)
         cost = np.where(squared <= self.config.gate, costs, NEVER)
         births = np.where(np.eye(len(boxes)), NEW, NEVER)  # a row of somebody new for each box
         rows, columns = self._assign(np.vstack([cost, births]))
@@ -128,6 +138,37 @@ class PeopleTracker:
         return [
             (int(i), int(j)) for i, j in zip(rows, columns, strict=True) if i < known and cost[i, j] < NEVER
         ]  # fmt: skip
+
+    def _sight(self, dt_s: float) -> Floats:
+        """(N,): -2 log of the odds that each has a box. Who was seen in the last frame is so again, and who was not is
+        hidden still (a Markov chain), so that nobody hidden takes the box of who is in front.
+        """
+        lost = -math.expm1(-dt_s / self.config.seen_for_s)
+        found = -math.expm1(-dt_s / self.config.hidden_for_s)
+        last = max(track.seen_frame for track in self.tracks)
+        again = np.where([track.seen_frame == last for track in self.tracks], 1.0 - lost, found)
+        return np.asarray(-2.0 * np.log(again / (1.0 - again)))[:, None]
+
+    def _classes(self, boxes: Sequence[PersonBox]) -> Floats:
+        """(N, M): -2 log of the probability of each box's class by the votes of each (Laplace's rule of succession)."""
+        rides = np.array([box.label != PEDESTRIAN for box in boxes])
+        walked = np.array([track.votes[PEDESTRIAN] for track in self.tracks])[:, None]
+        all_votes = np.array([track.votes.total() for track in self.tracks])[:, None]
+        return np.asarray(-2.0 * np.log((np.where(rides, all_votes - walked, walked) + 1.0) / (all_votes + 2.0)))
+
+    def _shapes(self, boxes: Sequence[PersonBox], t_ns: int) -> Floats:
+        """(N, M): -2 log of how likely each box has its width over its height after the last one of each, against one
+        of anybody: limbs swing, and what is in front covers them (Student's t).
+        """
+        config = self.config
+        last, now = ([b.log_width - math.log(max(b.tan_height, MIN_SLOPE)) for b in of]
+                     for of in ([track.box for track in self.tracks], boxes))  # fmt: skip
+        unseen_s = np.array([(t_ns - track.seen_ns) * 1e-9 for track in self.tracks])[:, None]
+        variance = config.sigma_shape**2 - config.sigma_stride**2 * np.expm1(-unseen_s / config.stride_s)
+        squared = np.square(np.subtract.outer(last, now)) / variance
+        cost = (SHAPE_DOF + 1.0) * np.log1p(squared / SHAPE_DOF) + np.log(variance / config.sigma_shapes**2)
+        same = np.equal.outer([track.box.label for track in self.tracks], [box.label for box in boxes])
+        return np.where(same, cost, 0.0)
 
     def _begin(self, boxes: list[PersonBox], matched: set[int], frame: OpenFrame, height_m: float) -> None:
         followed = np.array([boxes[k].box_px for k in matched]).reshape(-1, 4)

@@ -93,15 +93,18 @@ class _Bound:
         self._session = session
         first = session.run(outputs, {name: image})  # the first run: what is really there
         self.tensors = {output: np.empty(out.shape, np.float32) for output, out in zip(outputs, first, strict=True)}
+        self._name, self._image = name, image
         self._binding = session.io_binding()
-        self._binding.bind_input(name, "cpu", 0, np.float32, image.shape, image.ctypes.data)
         for output, buffer in self.tensors.items():
             self._binding.bind_output(output, "cpu", 0, np.float32, buffer.shape, buffer.ctypes.data)
         self.infer()  # warm-up of this path
 
     def infer(self) -> bool:
         """Runs on what is in the input; False where an output holds a number that is not finite."""
+        image = self._image  # bound anew for each run: an accelerator takes its copy when the input is bound
+        self._binding.bind_input(self._name, "cpu", 0, np.float32, image.shape, image.ctypes.data)
         self._session.run_with_iobinding(self._binding)
+        self._binding.synchronize_outputs()
         return all(np.isfinite(tensor).all() for tensor in self.tensors.values())
 
 

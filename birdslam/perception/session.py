@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+
 import onnxruntime as ort
 from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
 
 from birdslam.perception.manifest import Input, ManifestMismatch
 from birdslam.perception.onnx_files.subnormal import without_tiny_weights
 
-SESSION_ERRORS = tuple(
+SESSION_ERRORS: tuple[type[Exception], ...] = tuple(
     error for error in vars(ort_errors).values() if isinstance(error, type) and issubclass(error, Exception)
 )
+_START_ERRORS: tuple[type[Exception], ...] = (*SESSION_ERRORS, RuntimeError)  # the last: without TensorRT's libraries
 CPU = "CPUExecutionProvider"
 EXECUTION_PROVIDERS = {  # of the configuration -> of onnxruntime; the packages that bring them: docs/networks.md
     "cpu": CPU,
@@ -18,6 +22,8 @@ EXECUTION_PROVIDERS = {  # of the configuration -> of onnxruntime; the packages 
     "cuda": "CUDAExecutionProvider",
     "tensorrt": "TensorrtExecutionProvider",
 }
+_QUIET = 4  # what goes wrong is raised; onnxruntime's logger would write it to the terminal too
+_NVIDIA = frozenset({"cuda", "tensorrt"})
 _FLOAT32 = "tensor(float)"
 
 
@@ -31,7 +37,7 @@ def session_options(threads: int) -> ort.SessionOptions:
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.add_session_config_entry("session.inter_op.allow_spinning", "0")
     options.enable_mem_pattern = False  # as fast without, and 10 of 29 MB less for the shipped network
-    options.log_severity_level = 4  # what goes wrong is raised; its logger would write it to the terminal too
+    options.log_severity_level = _QUIET
     return options
 
 
@@ -54,6 +60,15 @@ def _options_of(provider: str, threads: int) -> dict[str, str]:
     if provider != "openvino":
         return {}
     return {"device_type": "CPU", "num_of_threads": str(threads), "precision": "FP32"}
+
+
+def _nvidia_libraries() -> str:
+    """Loads CUDA's and cuDNN's libraries from where pip put them; what went wrong, as onnxruntime prints it, or ""."""
+    if not hasattr(ort, "preload_dlls"):  # before 1.21: the loader's own path then
+        return ""
+    with contextlib.redirect_stdout(io.StringIO()) as said:
+        ort.preload_dlls()
+    return " ".join(said.getvalue().split())
 
 
 def plain_session(content: bytes, threads: int) -> ort.InferenceSession:
@@ -101,10 +116,13 @@ def open_session(
     if provider not in providers_here():
         raise ProviderMissing(f"this onnxruntime has no {provider}, but {', '.join(providers_here())}")
     wanted = EXECUTION_PROVIDERS[provider]
+    missing = _nvidia_libraries() if provider in _NVIDIA else ""
+    ort.set_default_logger_severity(_QUIET)
+    providers = [(wanted, _options_of(provider, threads)), CPU]
     try:
-        session = ort.InferenceSession(whole, options, providers=[(wanted, _options_of(provider, threads)), CPU])
-    except SESSION_ERRORS as error:
+        session = ort.InferenceSession(whole, options, providers=providers, enable_fallback=0)
+    except _START_ERRORS as error:
         raise ProviderMissing(f"{provider} does not begin: {error}") from error
     if session.get_providers()[0] != wanted:  # onnxruntime goes to the CPU by itself
-        raise ProviderMissing(f"{provider} does not begin on this computer")
+        raise ProviderMissing(f"{provider} does not begin on this computer{missing and ': ' + missing}")
     return session

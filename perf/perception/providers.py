@@ -10,6 +10,7 @@ a process that finds it first measures there.
 from __future__ import annotations
 
 import json
+import math
 import os
 import subprocess
 import sys
@@ -20,10 +21,11 @@ from typing import Any
 from birdslam.bench.figures import markdown
 from birdslam.perception.manifest import SHIPPED_MULTITASK, SHIPPED_NETWORKS
 from birdslam.perception.network import ModelSpec
-from birdslam.perception.session import providers_here
+from birdslam.perception.session import onnxruntime_version, providers_here
 from birdslam.perf.errors import PerfError
 from birdslam.perf.reporting.figures import Ledger
 from birdslam.perf.reporting.machine import describe
+from birdslam.perf.reporting.scorecard import RESULTS
 from birdslam.runtime.models.providers import TOLERANCE_REL, compared
 
 WITHIN_S = 3.0  # of a network and provider
@@ -43,7 +45,8 @@ def measure(
     print(f"{describe()['cpu']} ({', '.join(flags)}); this onnxruntime has {', '.join(here)}; {threads} threads")
     files = {"multitask": SHIPPED_NETWORKS / SHIPPED_MULTITASK}
     files |= {role: models / name for role, name in others.items() if (models / name).is_file()}
-    about = {"providers": list(here), "threads": threads, "flags": flags}
+    about = {"providers": list(here), "threads": threads, "flags": flags, "card": _card() if "cuda" in here else ""}
+    about["onnxruntime"] = onnxruntime_version()
     with Ledger(output, label, **about) as ledger:
         for role, file in files.items():
             spec = ModelSpec(path=str(file), threads=threads)
@@ -73,6 +76,16 @@ def _by_another(package: str, asked: str, models: Path, threads: int, ledger: Le
             ledger.add(name, f"{row['ms']:7.2f} ms a run", **row | {"package": package})
 
 
+def _card() -> str:
+    """NVIDIA's name of the first graphics card, "" where its driver tells none."""
+    asked = ["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]
+    try:
+        done = subprocess.run(asked, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+    return done.stdout.partition("\n")[0].strip()
+
+
 def processor_flags() -> set[str]:
     """As Linux names them."""
     for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
@@ -82,27 +95,48 @@ def processor_flags() -> set[str]:
 
 
 def page(text: str) -> str:
-    """docs/providers.md of the ledger."""
+    """docs/providers.md of the ledger, and of those that were kept from other computers."""
     ledger: dict[str, Any] = json.loads(text)
-    about, rows = ledger["settings"], []
-    for row in ledger["rows"]:
-        by = row.get("package", "onnxruntime")
-        used = "yes" if row["agrees"] else "no"
-        rows.append([row["network"], by, row["provider"], f"{row['ms']:.1f}", f"{row['off_rel']:.2%}", used])
-    head = ["network", "package", "provider", "ms a run", "off the CPU's outputs (RMS)", f"within {TOLERANCE_REL:.0%}"]
-    there = ", ".join(about["flags"]) or "none of those that matter"
+    kept = [json.loads(file.read_text(encoding="utf-8")) for file in sorted(RESULTS.glob("providers_*.json"))]
+    elsewhere = []
+    for other in kept:
+        card = other["settings"]["card"]
+        elsewhere += [
+            f"## {other['machine']['cpu']}{card and f' and {card}'}",
+            "",
+            f"{_where(other).capitalize()}, by onnxruntime {other['settings']['onnxruntime']} on "
+            f"{other['machine']['utc'][:10]}: `python -m perf networks --provider all`.",
+            "",
+            _table(other),
+        ]
     return "\n".join(
         (
             "# What computes the networks, and how fast",
             "",
             "Written by `python -m perf pages --write providers`: the median run of each network by each provider that "
-            f"is here, on {about['threads']} threads of {ledger['machine']['cpu']} with {there}. What is not within "
+            f"is here, {_where(ledger)} of {ledger['machine']['cpu']}. What is not within "
             'the tolerance `perceive.provider = "auto"` does not take, however fast it is '
             "([networks.md](networks.md#what-computes-them)). `onnxruntime-openvino` has a CPU provider too, of an "
             "older onnxruntime.",
             "",
-            markdown(head, rows),
-            "Not measured: processors with AVX-512 and VNNI (none was at hand for this page), CUDA and TensorRT.",
-            "",
+            _table(ledger),
+            *elsewhere,
         )
     )
+
+
+def _where(ledger: dict[str, Any]) -> str:
+    about = ledger["settings"]
+    return f"on {about['threads']} threads with {', '.join(about['flags']) or 'none of the instructions that matter'}"
+
+
+def _table(ledger: dict[str, Any]) -> str:
+    rows = []
+    for row in ledger["rows"]:
+        by = row.get("package", "onnxruntime")
+        used = "yes" if row["agrees"] else "no"
+        begins = math.isfinite(row["ms"])
+        figures = [f"{row['ms']:.1f}", f"{row['off_rel']:.2%}", used] if begins else ["does not begin", "", used]
+        rows.append([row["network"], by, row["provider"], *figures])
+    head = ["network", "package", "provider", "ms a run", "off the CPU's outputs (RMS)", f"within {TOLERANCE_REL:.0%}"]
+    return markdown(head, rows)

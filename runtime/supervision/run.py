@@ -25,7 +25,7 @@ from birdslam.outputs.plain_words import LengthsBy
 from birdslam.outputs.report.page import REPORT
 from birdslam.perception import ModelError, load_network
 from birdslam.perception.pointnet import load_pointnet
-from birdslam.runtime.configuration import Configuration, ConfigurationError, ModelsConfig, complete
+from birdslam.runtime.configuration import Configuration, ConfigurationError, complete
 from birdslam.runtime.environment import INTERRUPTED_STATUS
 from birdslam.runtime.nodes.sources import RecordedSource, open_source
 from birdslam.runtime.process import realtime
@@ -169,17 +169,17 @@ def check(configuration: Configuration) -> tuple[Configuration, dict[str, Any], 
     if recording.file:
         file = choose_file(recording, configuration.vehicle)
         configuration = msgspec.structs.replace(configuration, recording=msgspec.structs.replace(recording, file=file))
-    return configuration, _described(configuration.models), frames
+    return configuration, _described(configuration), frames
 
 
-def _described(models: ModelsConfig) -> dict[str, Any]:
-    """What each network is. Raises ModelError where one can't be used.
+def _described(configuration: Configuration) -> dict[str, Any]:
+    """What each network is, its provider as it is asked for. Raises ModelError where one can't be used.
 
     They are loaded in a process that ends: the supervisor would hold for all of the drive what that took, 50 MB.
     """
     context = multiprocessing.get_context("fork")
     receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=_describe, args=(models, sender), daemon=True)
+    process = context.Process(target=_describe, args=(configuration, sender), daemon=True)
     process.start()
     sender.close()
     try:
@@ -193,9 +193,15 @@ def _described(models: ModelsConfig) -> dict[str, Any]:
     return found
 
 
-def _describe(models: ModelsConfig, sender: Connection) -> None:
+def _describe(configuration: Configuration, sender: Connection) -> None:
+    models, asked = configuration.models, configuration.perceive.provider
     try:
-        out = {role: load_network(role, spec).describe() for role, spec in models.in_use().items()}
+        # Loaded on the CPU here. What computes it in perceive is in its log, and in PROVIDER_MISSING
+        out = {
+            role: load_network(role, msgspec.structs.replace(spec, provider="cpu")).describe()
+            | {"provider": spec.provider or asked}
+            for role, spec in models.in_use().items()
+        }
         if models.pointnet is not None:
             out["pointnet"] = load_pointnet(models.pointnet).describe()
         sender.send(out)
