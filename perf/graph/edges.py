@@ -84,9 +84,10 @@ def variants() -> dict[str, Variant]:
         return Variant(replace(base, graph=msgspec.structs.replace(base.graph, **fields)))
 
     def out(*edges: str) -> Variant:
-        return Variant(replace(base, weights=msgspec.structs.replace(base.weights, leave_out=("vv", *edges))))
+        return Variant(replace(base, weights=msgspec.structs.replace(base.weights, leave_out=("vv", "lanes", *edges))))
 
     moved = graph(vehicles_move_ego=True)
+    with_lanes = Variant(replace(base, weights=msgspec.structs.replace(base.weights, leave_out=("vv",))))
     gates = {"detection_gate_sigma": NO_GATE, "landmark_gate_sigma": NO_GATE}
     bare = {"correlation_length_m": 0.0, "front_back_ambiguity": False}
     found = {
@@ -94,17 +95,17 @@ def variants() -> dict[str, Variant]:
         "vehicles move the ego": moved,
         "without CC": out("cc"),
         "without CP: CC alone": out("cp"),
-        "without lanes: CC and points": out("lanes"),
-        "CC and lanes": replace(Variant(base), change=_without_points),
+        "with lanes": with_lanes,
+        "CC and lanes": replace(with_lanes, change=_without_points),
         "CC and vehicles": replace(moved, live=replace(moved.live, weights=out("cp").live.weights)),
         "VV beside constant velocity": Variant(
-            replace(base, weights=msgspec.structs.replace(base.weights, leave_out=()))
+            replace(base, weights=msgspec.structs.replace(base.weights, leave_out=("lanes",)))
         ),
         "VV alone, as in Eq. 6": Variant(
             replace(
                 base,
                 graph=msgspec.structs.replace(base.graph, constant_velocity=False),
-                weights=msgspec.structs.replace(base.weights, leave_out=()),
+                weights=msgspec.structs.replace(base.weights, leave_out=("lanes",)),
             )
         ),
         "landmarks share no error": Variant(base, _sharing_nothing),
