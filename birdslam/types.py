@@ -229,13 +229,16 @@ class LandmarkEdge(msgspec.Struct, frozen=True, kw_only=True, array_like=True, g
     frame: FrameId
     x_m: float  # in ego
     y_m: float
-    cov: Cov2
+    cov: Cov2  # its own part and what it shares
     kind: LandmarkKind = LandmarkKind.ROAD_POINT  # a feature on the road (0) or a station of a lane (1)
+    # (2, 2), row-major: metres by which 1-sigma of the frame's pitch (first column) and of its height moves this and
+    # all other landmarks of the frame together; None: it shares nothing
+    shared: Cov2 | None = None
 
     def __post_init__(self) -> None:
         cov = self.cov
-        if not _is_sound(self.x_m + self.y_m + sum(cov), cov[0], cov[3]):
-            check_finite(self, "x_m", "y_m")
+        if not _is_sound(self.x_m + self.y_m + sum(cov) + (sum(self.shared) if self.shared else 0.0), cov[0], cov[3]):
+            check_finite(self, "x_m", "y_m", *(("shared",) if self.shared else ()))
             _check_cov(self, "cov")
         if self.landmark >= _STATION_IDS and self.kind is LandmarkKind.ROAD_POINT:  # an older record
             msgspec.structs.force_setattr(self, "kind", LandmarkKind.LANE_STATION)

@@ -22,7 +22,7 @@ from birdslam.bench.simulation.drive import Drive, DriveConfig, drive
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.planar import between
 from birdslam.geometry.se2 import SE2
-from birdslam.graph.factors.landmark_points import LandmarkPoints, sum_of_points
+from birdslam.graph.factors.landmark_points import SHARED_LASTS, LandmarkPoints, sum_of_points
 from birdslam.graph.factors.standard import standard_factors
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
@@ -30,7 +30,7 @@ from birdslam.graph.weights import WeightsConfig
 from birdslam.perf.__main__ import main as perf_main
 from birdslam.perf.latency import incremental, optimizer
 from birdslam.perf.latency.optimizer import CONTENDERS
-from birdslam.types import EgoEdge, Estimate, LanePoint, Measurements, Status
+from birdslam.types import EgoEdge, Estimate, LandmarkEdge, LanePoint, Measurements, Status
 
 ALL_EDGES = WeightsConfig(leave_out=())
 EQ_6 = GraphConfig(
@@ -389,7 +389,8 @@ def test_landmark_edges_sum_exactly_to_one_at_their_centroid(n: int, seed: int) 
     gaps, A = rng.normal(size=(n, 2)) * 3.0, rng.normal(size=(n, 2, 2))
     covs = A @ A.transpose(0, 2, 1) + 0.01 * np.eye(2)
     xx, xy, yy = covs[:, 0, 0], covs[:, 0, 1], covs[:, 1, 1]
-    centroid, mean, deviator = sum_of_points(gaps[:, 0] + 1j * gaps[:, 1], 0.5 * (xx + yy), 0.5 * (xx - yy) + 1j * xy)
+    points = gaps[:, 0] + 1j * gaps[:, 1], 0.5 * (xx + yy), 0.5 * (xx - yy) + 1j * xy
+    centroid, mean, deviator = sum_of_points(*points, np.zeros((2, n), np.complex128))
     g = np.array([centroid.real, centroid.imag])
     C = np.array([[mean + deviator.real, deviator.imag], [deviator.imag, mean - deviator.real]])
 
@@ -402,6 +403,22 @@ def test_landmark_edges_sum_exactly_to_one_at_their_centroid(n: int, seed: int) 
     np.testing.assert_allclose(np.linalg.inv(C), np.linalg.inv(covs).sum(axis=0), rtol=1e-8)
 
 
+def test_what_landmarks_share_does_not_average_away() -> None:
+    """The covariance of the weighted centroid by what each errs by itself and by what all err by together."""
+    rng = np.random.default_rng(0)
+    A, S = rng.normal(size=(7, 2, 2)), rng.normal(size=(3, 7, 2))
+    own = A @ A.transpose(0, 2, 1) + 0.01 * np.eye(2)
+    covs = own + np.einsum("kni,knj->nij", S, S)
+    xx, xy, yy = covs[:, 0, 0], covs[:, 0, 1], covs[:, 1, 1]
+    points = np.zeros(7, np.complex128), 0.5 * (xx + yy), 0.5 * (xx - yy) + 1j * xy
+    _, mean, deviator = sum_of_points(*points, S[..., 0] + 1j * S[..., 1])
+    W = np.linalg.inv(covs)
+    C, moved = np.linalg.inv(W.sum(axis=0)), np.einsum("nij,knj->ik", W, S)
+    expected = C @ (np.einsum("nij,njk,nkl->il", W, own, W) + SHARED_LASTS * moved @ moved.T) @ C
+    found = np.array([[mean + deviator.real, deviator.imag], [deviator.imag, mean - deviator.real]])
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
 def ego_ate(world: Drive, weights: WeightsConfig) -> float:
     errors = [off(e.T_world_ego, world.ego[e.frame_id])[:2] for e in run(world.measurements, GraphConfig(), weights)]
     return float(np.sqrt(np.mean(np.sum(np.square(errors), axis=1))))
@@ -410,9 +427,14 @@ def ego_ate(world: Drive, weights: WeightsConfig) -> float:
 def with_common_error(world: Drive, rng: np.random.Generator) -> Drive:
     """Landmarks as Eq. 1 sees them with a wrong height and a pitch that shakes: all of a frame are off together."""
     far = [1.02 * (1.0 + 0.02 * rng.standard_normal()) for _ in world.measurements]
+
+    def off_together(e: LandmarkEdge, s: float) -> LandmarkEdge:
+        x, y = 0.02 * e.x_m, 0.02 * e.y_m  # by either
+        cov = np.reshape(e.cov, (2, 2)) + 2.0 * np.outer((x, y), (x, y))
+        return replace(e, x_m=s * e.x_m, y_m=s * e.y_m, cov=tuple(cov.ravel().tolist()), shared=(x, x, y, y))
+
     measurements = [
-        replace(m, cp=tuple(replace(e, x_m=s * e.x_m, y_m=s * e.y_m) for e in m.cp))
-        for m, s in zip(world.measurements, far, strict=True)
+        replace(m, cp=tuple(off_together(e, s) for e in m.cp)) for m, s in zip(world.measurements, far, strict=True)
     ]
     return Drive(measurements, world.ego, world.vehicles)
 
@@ -682,9 +704,7 @@ def test_landmarks_summed_for_gtsam_say_what_ours_say() -> None:
         contender = CONTENDERS["incremental_fixed_lag_summed"][0]()
         return float([np.trace(contender.step(m)[0][1][:2, :2]) for m in records][-1])  # type: ignore[index]
 
-    cov = run(log, GraphConfig(constant_velocity=False, landmark_common_along_m=0.0, landmark_common_across_m=0.0))[
-        -1
-    ].cov
+    cov = run(log, GraphConfig(constant_velocity=False))[-1].cov
     assert variance(log) < 0.8 * variance([replace(m, cp=()) for m in log])
     assert variance(log) == pytest.approx(
         np.trace(np.reshape(cov, (3, 3))[:2, :2]), rel=0.1

@@ -23,7 +23,7 @@ from birdslam.lanes.ego_lane import EgoLane
 from birdslam.lanes.line_tracker import LineTracker, still_lines
 from birdslam.lanes.occupancy import with_users
 from birdslam.lanes.outline import lane_mask, lane_px
-from birdslam.lanes.paint import LinePoints, paint_points
+from birdslam.lanes.paint import RESOLVED_M, LinePoints, paint_points
 from birdslam.lanes.road_view import road_view
 from birdslam.lanes.topology import lane_row
 from birdslam.lanes.traffic import Traffic, TrafficState
@@ -229,6 +229,16 @@ def test_a_dash_between_cracks_is_no_symbol() -> None:
         seen.append(int(on_dash.sum()))
     clear, cracked = seen
     assert cracked > 0.8 * clear > 5
+
+
+def test_a_far_ridge_that_no_network_has_is_no_line_where_kerbs_and_paint_are_one_pixel() -> None:
+    """Near ones count; how far is a matter of pixels, not of metres."""
+    image, masks = picture(SE2(), (1.7, -1.8), (False, False))
+    masked, unseen = points_of(image, masks), points_of(image, Segmentation(masks.road, np.zeros_like(masks.lane)))
+    pixel_m = 1.0 / CAMERA.fx_px
+    assert 0.9 * RESOLVED_M < unseen.x_m.max() * pixel_m <= RESOLVED_M
+    assert masked.x_m.max() * pixel_m > 1.2 * RESOLVED_M
+    assert np.count_nonzero(masked.x_m * pixel_m <= RESOLVED_M) == len(unseen)
 
 
 def test_grass_that_a_network_takes_for_road_and_paint_bears_no_line() -> None:

@@ -9,8 +9,9 @@ import pytest
 from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2, wrap
+from birdslam.vehicles.association import predicted_boxes_px
 from birdslam.vehicles.placement.depth_fusion import DepthPlace
-from birdslam.vehicles.placement.localisation import LocalisationConfig, observe_boxes
+from birdslam.vehicles.placement.localisation import LocalisationConfig, iou, observe_boxes
 from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
 from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
 from birdslam.vehicles.track import EgoFrame, Track, TrackingConfig
@@ -291,3 +292,40 @@ def test_each_filter_has_a_row_for_each_track_and_no_other() -> None:
         for row, track in enumerate(tracker.tracks):
             if track.frame.frame_id == k and track.place.assumed is not None:
                 assert track.place.assumed.standing == tracker.placing.parallax.standing(row)
+
+
+def test_a_car_that_is_lost_leaves_no_id_to_the_parked_one_beside() -> None:
+    """The nearer car of a row is missed for good: the farther one's box, which overlaps its own, is another car's."""
+    drive = Drive()
+    near, far = SE2(20.0, -4.0), SE2(21.5, -5.6)
+    known = {track.vehicle for k in range(10) for track in drive.step(SE2(0.3 * k, 0.0), [near])}
+    others = {track.vehicle for k in range(10, 13) for track in drive.step(SE2(0.3 * k, 0.0), [far])}
+    assert len(known) == len(others) == 1
+    assert known != others
+
+
+def test_no_car_gives_its_box_away_so_that_its_neighbour_gets_one() -> None:
+    """A box is lost at the end of a row where each box overlaps its neighbour's: the others keep their own."""
+    drive = Drive()
+    row = [SE2(30.0 + 1.5 * i, -2.0 - 0.8 * i) for i in range(3)]
+    for k in range(10):
+        tracks = drive.step(SE2(0.1 * k, 0.0), row[1:])
+    middle, _ = sorted(tracks, key=lambda track: track.pose().x_m)
+    drive.step(SE2(1.0, 0.0), row[:2])
+    own = box_px(SE2(1.0, 0.0).between(row[1]))
+    assert own is not None
+    assert middle.observation.box_px == pytest.approx(tuple(own))
+
+
+@pytest.mark.parametrize("left", [-1.0, 1.0])
+def test_a_car_that_the_image_cuts_off_is_expected_to_reach_its_border(left: float) -> None:
+    drive = Drive()
+    tracks = [track for k in range(12) for track in drive.step(SE2(0.8 * k, 0.0), [SE2(16.0, 3.0 * left)])]
+    track = tracks[-1]
+    ego = SE2(float(track.pose().x_m) - 4.5, 0.0)
+    footprint = np.array([(sx * 2.0, sy * 0.85) for sx in (-1, 1) for sy in (-1, 1)])
+    corners = np.vstack([np.column_stack([ego.between(track.pose()) @ footprint, np.full(4, z)]) for z in (0.0, 1.5)])
+    px = bev.ego_to_pixel(CAMERA, drive.ground_size.ground, corners)
+    true = np.clip([*px.min(axis=0), *px.max(axis=0)], 0.0, [1242.0, 375.0, 1242.0, 375.0])
+    (predicted,) = predicted_boxes_px([track], CAMERA, ego, drive.ground_size.ground)
+    assert iou(predicted[None], true[None])[0, 0] > 0.8

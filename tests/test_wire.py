@@ -189,7 +189,17 @@ EXAMPLES: tuple[msgspec.Struct, ...] = (
             ),
         ),
         vv=(MotionEdge(vehicle=7, from_frame=4710, to_frame=4711, T_from_to=SE2(0.3, 0.002, 0.001), cov=_COV3),),
-        cp=(LandmarkEdge(landmark=90_001, frame=4711, x_m=11.75, y_m=-2.5, cov=_COV2, kind=LandmarkKind.LANE_STATION),),
+        cp=(
+            LandmarkEdge(
+                landmark=90_001,
+                frame=4711,
+                x_m=11.75,
+                y_m=-2.5,
+                cov=_COV2,
+                kind=LandmarkKind.LANE_STATION,
+                shared=(0.25, 0.125, -0.0625, 0.03125),
+            ),
+        ),
         lanes=(LanePoint(9.5, 1.75, 12), LanePoint(14.25, 1.8, 13)),
         attitude=_ATTITUDE,
         ground=_GROUND,

@@ -88,8 +88,22 @@ def road_point_cov(
     """Covariances (N, 2, 2) in m^2 of `pixel_to_ego`, to first order.
 
     `sigma_px` is the pixel noise, one for all, or (2,) for u and v. Pitch and height errors are common to all points of
-    a frame; they are added to each point as if they were its own.
+    a frame; they are added to each point as if they were its own (`road_point_errors` has them apart).
     """
+    J = road_point_errors(camera, ground, px, sigma_px, sigma_pitch_rad, sigma_height_rel)
+    out: Floats = J @ np.swapaxes(J, 1, 2)
+    return out
+
+
+def road_point_errors(
+    camera: Camera,
+    ground: GroundPlane,
+    px: Floats,
+    sigma_px: Floats | float,
+    sigma_pitch_rad: float,
+    sigma_height_rel: float,
+) -> Floats:
+    """(N, 2, 4) in m: what 1-sigma of the point's column and row, and of all points' pitch and height moves it by."""
     px = np.atleast_2d(np.asarray(px, dtype=np.float64))
     sigma_u, sigma_v = np.broadcast_to(np.asarray(sigma_px, dtype=np.float64), (2,))
     step_px, step_rad = 0.5, 1e-4
@@ -107,6 +121,5 @@ def road_point_cov(
         (tilted(step_rad) - tilted(-step_rad)) / (2.0 * step_rad) * sigma_pitch_rad,
         here * sigma_height_rel,
     ]
-    J = np.stack(columns, axis=-1)  # (N, 2, 4), already scaled by the sigmas
-    out: Floats = J @ np.swapaxes(J, 1, 2)
+    out: Floats = np.stack(columns, axis=-1)
     return out

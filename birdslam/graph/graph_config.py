@@ -37,10 +37,6 @@ class GraphConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     front_back_ambiguity: bool = True  # a CV edge may take a vehicle's front for its back; False: its yaw is believed
     # Static map
     landmark_gate_sigma: Positive = 3.0  # Mahalanobis distance past which a landmark weighs less
-    # 1-sigma of what is common to all landmarks that tie two key frames, along the ego's axis: an error of the pitch
-    # moves them all (bench/simulation/edge_statistics.py measures both)
-    landmark_common_along_m: NotNegative = 0.2
-    landmark_common_across_m: NotNegative = 0.04  # the same across it
     # Where X_p of Eq. 3 is. key_frame: where the last key frame saw it, as uncertain as that sight and that pose;
     # first_sight: in the world, put there once by the frame that saw it first and known from then on, as in the paper
     landmark_anchor: LandmarkAnchor = "key_frame"

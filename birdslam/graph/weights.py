@@ -21,7 +21,7 @@ class WeightsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     `leave_out` names the edge types that do not enter the graph (the ablations of Table 3); "lanes" are the CP edges of
     lanes, "cp" all. None is the mode's own
     choice: the paper leaves out nothing; `measured` leaves out VV, which the tracker predicts from the very detections
-    that the CV edges carry, since the graph has a constant-velocity factor of its own.
+    that the CV edges carry, since the graph has a constant-velocity factor of its own, and lanes, which move nothing.
     """
 
     # measured: each edge has its own covariance; paper: the weights below
@@ -43,7 +43,7 @@ class WeightsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """The edge types that do not enter the graph."""
         if self.leave_out is not None:
             return self.leave_out
-        return () if self.mode == "paper" else ("vv",)
+        return () if self.mode == "paper" else ("vv", "lanes")
 
     def cv_at(self, depth_m: float) -> float:
         """The CV weight: `cv_near` at the camera, `cv_far` from `cv_far_m` on, linear in the logarithm between."""
@@ -79,7 +79,8 @@ def weighted(measurements: Measurements, config: WeightsConfig) -> Measurements:
     cc = measurements.cc
     if config.mode == "paper":
         cp_cov, vv_cov = effective_cov(config.cp, 2), effective_cov(config.vv, 3)  # Eq. 4, here and in the next lines
-        cp = tuple(replace(edge, cov=cp_cov) for edge in cp)
+        # Each CP edge counts alike, however many there are
+        cp = tuple(replace(edge, cov=cp_cov, shared=None) for edge in cp)
         cv = tuple(
             # What Eq. 4 says of an edge is all: of its size nothing
             replace(edge, cov=effective_cov(config.cv_at(edge.T_ego_vehicle.x_m), 3), sigma_log_height=0.0)

@@ -25,6 +25,9 @@ SYMBOL_SHARE = 0.5  # of the contrast of an image's brightest paint: kerbstones 
 BAND_M = 1.2  # the widest paint that stands out from its row
 LEAST_CONTRAST = 6.0  # grey levels of a ridge over both sides
 NOISE_FACTOR = 5.0  # ... and in multiples of what bare road answers
+# A ridge that no network has counts as far as a line of 0.14 m is two pixels wide: farther off it may be a kerbstone, a
+# rail or a joint as well, and blurs with the paint beside it
+RESOLVED_M = 0.07
 MASK_REACH_M = 0.24  # from a mask's paint to its ridge
 WIDEST_M = 0.9  # of a mask's paint: a wider one is no line
 SIGMA_RIDGE_M = 0.03  # of a ridge's middle, beside a share of a pixel
@@ -183,6 +186,7 @@ def _ridges(view: RoadView, response: Floats32, least: float, usable: Bools) -> 
     # A weaker ridge counts where a network sees paint
     weak = usable & (near_paint > 0) & (response > 0.5 * least)
     peaks |= weak & (crest >= cv2.dilate(crest, np.ones((1, apart), np.uint8)))
+    peaks &= (near_paint > 0) | (view.sigma_y_m[:, None] <= RESOLVED_M)
     rows, columns = peaks.nonzero()
     return rows, columns, near_paint[rows, columns] > 0
 

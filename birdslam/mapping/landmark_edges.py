@@ -41,14 +41,14 @@ def landmark_edges(
     with np.errstate(invalid="ignore"):
         near = np.flatnonzero(points[:, 0] < config.landmark_range_m)
     near = near[np.argsort(points[near, 0], kind="stable")][: config.max_landmarks]
-    covs = bev.road_point_cov(
+    J = bev.road_point_errors(
         camera, ground, px[near], config.sigma_landmark_px, sigma_pitch_rad, config.sigma_height_rel
     )
-    flat = covs.reshape(-1, 4)
+    flat, shared = (J @ np.swapaxes(J, 1, 2)).reshape(-1, 4), J[:, :, 2:].reshape(-1, 4)
     known = np.isfinite(flat).all(axis=1)
-    near, flat = near[known], flat[known]
-    numbers = zip(ids[near].tolist(), points[near].tolist(), flat.tolist(), strict=True)
+    near, flat, shared = near[known], flat[known], shared[known]
+    numbers = zip(ids[near].tolist(), points[near].tolist(), flat.tolist(), shared.tolist(), strict=True)
     return tuple(
-        LandmarkEdge(landmark=landmark, frame=frame_id, x_m=x_m, y_m=y_m, cov=tuple(cov))
-        for landmark, (x_m, y_m), cov in numbers
+        LandmarkEdge(landmark=landmark, frame=frame_id, x_m=x_m, y_m=y_m, cov=tuple(cov), shared=tuple(moved))
+        for landmark, (x_m, y_m), cov, moved in numbers
     )

@@ -17,35 +17,71 @@ from birdslam.vehicles.track import Track
 
 MAX_SIGMA_HEIGHT_REL = 0.2  # of a box's height, as a fraction; past it the box measures no size
 MIN_TAN_HEIGHT = 1e-3  # of a box's height at a depth of 1
+BORDER_PX = 8.0  # an edge so near to the image's border is cut off by it: detectors draw it a little inside
 HORIZON_M = 1e4  # a point of the road so far ahead is imaged at the horizon
 
 
 def predicted_boxes_px(
     tracks: Sequence[Track], camera: Camera, T_world_ego: SE2, ground: GroundPlane
 ) -> NDArray[np.float64]:
-    """(N, 4): where each track's last box is expected in the current image; NaN behind the camera.
+    """(N, 4): where each track's last box is expected in the current image; NaN behind the camera, or out of view.
 
-    The box's distance to the horizon and its size go with the inverse of the depth, whatever the ground plane.
+    The box's distance to the horizon and its height go with the inverse of the depth, whatever the ground plane. Its
+    outer side is of the vehicle's near end, its inner side of the far one. An edge where the image's border cut the
+    vehicle off stays there, or moves out: beyond it is more of the vehicle.
     """
     boxes = np.full((len(tracks), 4), np.nan)
     if not tracks:
         return boxes
     centres = np.array([track.state[:2] for track in tracks])
     then = np.array([in_ego(track.frame.T_world_ego, track.state[:2]) for track in tracks])
-    now = T_world_ego.inverse() @ centres
+    step = T_world_ego.inverse() @ centres - then
     depth = np.array([track.place.depth_m for track in tracks])
-    bearing = np.array([track.observation.bearing for track in tracks])
-    near = np.column_stack([depth, depth * bearing]) + now - then
-    ahead = near[:, 0] >= NEAREST_M
-    slopes = np.concatenate([bearing[ahead], near[ahead, 1] / near[ahead, 0]])
+    ahead = depth + step[:, 0] >= NEAREST_M
+    if not ahead.any():
+        return boxes
+    step, depth = step[ahead], depth[ahead, None]
+    seen = [track for track, is_ahead in zip(tracks, ahead.tolist(), strict=True) if is_ahead]
+    sides = np.array([(track.observation.left, track.observation.right) for track in seen])
+    inner = np.column_stack([sides[:, 0] < 0.0, sides[:, 1] > 0.0])  # seen from straight ahead
+    reach = depth + np.where(inner, np.array([_depth_span_m(track) for track in seen])[:, None], 0.0)
+    sides_now = (reach * sides + step[:, 1:]) / (reach + step[:, :1])
+    slopes = np.stack([sides, sides_now]).ravel()
     horizon = bev.ego_to_pixel(camera, ground, HORIZON_M * np.column_stack([np.ones(len(slopes)), slopes]))
-    horizon_then, horizon_now = horizon.reshape(2, -1, 2)
-    last = np.array([track.observation.box_px for track in tracks])[ahead]
-    scale = depth[ahead] / near[ahead, 0]
-    half_px = (last[:, 2] - last[:, 0]) / 2.0 * scale
-    rows = horizon_now[:, 1, None] + (last[:, [1, 3]] - horizon_then[:, 1, None]) * scale[:, None]
-    boxes[ahead] = np.column_stack([horizon_now[:, 0] - half_px, rows[:, 0], horizon_now[:, 0] + half_px, rows[:, 1]])
+    horizon_then, horizon_now = horizon.reshape(2, -1, 2, 2)  # (N, sides, 2)
+    last = np.array([track.observation.box_px for track in seen])
+    moved = np.empty_like(last)
+    moved[:, ::2] = last[:, ::2] + horizon_now[..., 0] - horizon_then[..., 0]
+    from_horizon = (last[:, 1::2] - horizon_then[..., 1].mean(axis=1, keepdims=True)) * depth / (depth + step[:, :1])
+    moved[:, 1::2] = horizon_now[..., 1].mean(axis=1, keepdims=True) + from_horizon
+    boxes[ahead] = _within_image(moved, last, camera)
     return boxes
+
+
+def _depth_span_m(track: Track) -> float:
+    """How much farther than the near end of a vehicle its far end is."""
+    yaw_rad = track.yaw_rad - track.frame.T_world_ego.yaw_rad
+    size = track.observation.dimensions
+    return abs(math.cos(yaw_rad)) * size.length_m + abs(math.sin(yaw_rad)) * size.width_m
+
+
+def _within_image(moved: NDArray[np.float64], last: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+    """Boxes (N, 4) cut by the image's border, which had cut some edges of `last` (N, 4) before; NaN outside of it."""
+    size_px = np.array([camera.width_px, camera.height_px])
+    least, most = last[:, :2], last[:, 2:]
+    upper = np.where(least < BORDER_PX, np.minimum(moved[:, :2], least), moved[:, :2])
+    lower = np.where(most > size_px - BORDER_PX, np.maximum(moved[:, 2:], most), moved[:, 2:])
+    upper, lower = np.clip(upper, 0.0, size_px), np.clip(lower, 0.0, size_px)
+    boxes = np.hstack([upper, lower])
+    boxes[(lower <= upper).any(axis=1)] = np.nan
+    return boxes
+
+
+def at_border(boxes_px: NDArray[np.float64], camera: Camera) -> NDArray[np.bool_]:
+    """(N,): which of the boxes (N, 4) the image's border cuts."""
+    size_px = np.array([camera.width_px, camera.height_px])
+    cut = np.hstack([boxes_px[:, :2] < BORDER_PX, boxes_px[:, 2:] > size_px - BORDER_PX])
+    return np.asarray(cut.any(axis=1))
 
 
 def with_track_ids(observations: Sequence[Observation], track_ids: NDArray[np.int64]) -> list[Observation]:

@@ -23,6 +23,8 @@ class TrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """When boxes are the same vehicle, and how vehicles move."""
 
     min_iou: float = 0.15  # of a box with the one predicted from bird's-eye view
+    min_iou_just_seen: float = 0.4  # of one seen within `just_seen_s` and not cut by the image's border: 1 of 1,000
+    just_seen_s: float = 0.15  # boxes of a vehicle overlap less, nine of ten neighbours' do
     gate_sigma: float = 3.0  # Mahalanobis distance in bird's-eye view past which boxes are never the same vehicle
     birth_score: float = 0.5  # a detection must reach it to begin a track
     confirm_hits: int = 2  # a track gets its id when it has been seen so often; KITTI tracking chose between 2 and 3

@@ -17,7 +17,7 @@ from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2, wrap
 from birdslam.perception import DepthMap, Detections
 from birdslam.types import MotionEdge
-from birdslam.vehicles.association import by_track_id, predicted_boxes_px, with_track_ids, within_gate
+from birdslam.vehicles.association import at_border, by_track_id, predicted_boxes_px, with_track_ids, within_gate
 from birdslam.vehicles.placement.depth_fusion import DepthPlace, PseudoLidarConfig
 from birdslam.vehicles.placement.localisation import LocalisationConfig, Observation, Place, iou, observe_boxes
 from birdslam.vehicles.placement.pseudolidar import FrustumNetwork, locate_by_depth
@@ -157,21 +157,26 @@ class Tracker:
         return [Assignment(row, tracks[row], observations[k], by_depth[k] if by_depth else None) for row, k in pairs]
 
     def _associate(self, T_world_ego: SE2, observations: list[Observation]) -> list[tuple[int, int]]:
-        """(row of a track, its observation): least cost, 1 - IoU of predicted and seen box, within the gates."""
+        """(row of a track, its observation): the most overlap of predicted and seen boxes, within the gates."""
         if not self.tracks or not observations:
             return []
         if observations[0].track_id is not None:
             return by_track_id(self.tracks, observations)
-        overlap = iou(
-            predicted_boxes_px(self.tracks, self.camera, T_world_ego, self.ground_size.ground),
-            np.array([o.box_px for o in observations]),
-        )
-        overlap = np.nan_to_num(overlap, nan=0.0)
-        possible = (overlap >= self.config.min_iou) & within_gate(
-            self.tracks, observations, T_world_ego, self.config.gate_sigma
-        )
-        rows, columns = self._assign(np.where(possible, 1.0 - overlap, 2.0))
+        predicted = predicted_boxes_px(self.tracks, self.camera, T_world_ego, self.ground_size.ground)
+        overlap = np.nan_to_num(iou(predicted, np.array([o.box_px for o in observations])), nan=0.0)
+        more = overlap - self._least_overlap(predicted)[:, None]
+        possible = (more >= 0.0) & within_gate(self.tracks, observations, T_world_ego, self.config.gate_sigma)
+        # A track without a box costs as much as one with a box at the bound: no box is taken so that others get one
+        rows, columns = self._assign(np.where(possible, -more, 0.0))
         return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if possible[i, j]]
+
+    def _least_overlap(self, predicted_px: Floats) -> Floats:
+        """(N,) of each track's box with the one predicted (N, 4), for it to be the same vehicle's."""
+        assert self._last is not None
+        t_ns = self._last.t_source_ns
+        unseen_s = np.array([(t_ns - track.frame.t_source_ns) * 1e-9 for track in self.tracks])
+        surely = (unseen_s <= self.config.just_seen_s) & ~at_border(predicted_px, self.camera)
+        return np.where(surely, self.config.min_iou_just_seen, self.config.min_iou)
 
     def _correct(self, assignments: Sequence[Assignment], places: Sequence[Place], frame: EgoFrame) -> None:
         """The known tracks among the assignments, all at once, by the places of their observations in this frame."""

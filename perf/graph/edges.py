@@ -26,7 +26,7 @@ from birdslam.bench.ego.truth_quality import AXES_SIGMA_RAD
 from birdslam.bench.figures import markdown
 from birdslam.bench.simulation.edge_statistics import EdgeStatistics, edge_statistics
 from birdslam.bench.simulation.odometry import SimulatedOdometry, SimulationConfig
-from birdslam.bench.tracking.benchmark import LEAST_FRAMES, Live, Truth, make_log, ours
+from birdslam.bench.tracking.benchmark import LEAST_FRAMES, Live, Truth, inflated, make_log, ours
 from birdslam.bench.tracking.localisation import CAMERA_OF_BOXES
 from birdslam.bench.tracking.metrics import path_errors
 from birdslam.geometry.arrays import Floats
@@ -48,7 +48,7 @@ from birdslam.slam import SlamConfig
 from birdslam.sources.kitti_tracking import open_tracking, read_detections
 from birdslam.sources.opening import open_recording
 from birdslam.trajectory import as_poses, inverse, mount_pose, split_pose
-from birdslam.types import LandmarkKind, Measurements
+from birdslam.types import LandmarkEdge, LandmarkKind, Measurements
 from birdslam.vehicles.rts_smoother import RtsSmoother, SmootherConfig
 
 label = "what each edge of the graph is worth, on images and on simulated drives"
@@ -84,33 +84,33 @@ def variants() -> dict[str, Variant]:
         return Variant(replace(base, graph=msgspec.structs.replace(base.graph, **fields)))
 
     def out(*edges: str) -> Variant:
-        return Variant(replace(base, weights=msgspec.structs.replace(base.weights, leave_out=("vv", *edges))))
+        return Variant(replace(base, weights=msgspec.structs.replace(base.weights, leave_out=("vv", "lanes", *edges))))
 
     moved = graph(vehicles_move_ego=True)
+    with_lanes = Variant(replace(base, weights=msgspec.structs.replace(base.weights, leave_out=("vv",))))
     gates = {"detection_gate_sigma": NO_GATE, "landmark_gate_sigma": NO_GATE}
-    apart = {"landmark_common_along_m": 0.0, "landmark_common_across_m": 0.0}
-    bare = {**apart, "correlation_length_m": 0.0, "front_back_ambiguity": False}
+    bare = {"correlation_length_m": 0.0, "front_back_ambiguity": False}
     found = {
         "default": Variant(base),
         "vehicles move the ego": moved,
         "without CC": out("cc"),
         "without CP: CC alone": out("cp"),
-        "without lanes: CC and points": out("lanes"),
-        "CC and lanes": replace(Variant(base), change=_without_points),
+        "with lanes": with_lanes,
+        "CC and lanes": replace(with_lanes, change=_without_points),
         "CC and vehicles": replace(moved, live=replace(moved.live, weights=out("cp").live.weights)),
         "VV beside constant velocity": Variant(
-            replace(base, weights=msgspec.structs.replace(base.weights, leave_out=()))
+            replace(base, weights=msgspec.structs.replace(base.weights, leave_out=("lanes",)))
         ),
         "VV alone, as in Eq. 6": Variant(
             replace(
                 base,
                 graph=msgspec.structs.replace(base.graph, constant_velocity=False),
-                weights=msgspec.structs.replace(base.weights, leave_out=()),
+                weights=msgspec.structs.replace(base.weights, leave_out=("lanes",)),
             )
         ),
-        "landmarks share no error": graph(**apart),
+        "landmarks share no error": Variant(base, _sharing_nothing),
         "without gates": graph(**gates),
-        "gates alone": graph(**bare),
+        "gates alone": replace(graph(**bare), change=_sharing_nothing),
     }
     for name, field in (("CC", "cc"), ("CP", "cp"), ("CV", "cv")):
         for word, factor in (("halved", 2.0), ("doubled", 0.5)):
@@ -122,6 +122,11 @@ def _without_points(m: Measurements) -> Measurements:
     return msgspec.structs.replace(m, cp=tuple(e for e in m.cp if e.kind is LandmarkKind.LANE_STATION))
 
 
+def _sharing_nothing(m: Measurements) -> Measurements:
+    """What landmarks share as if it were each one's own."""
+    return msgspec.structs.replace(m, cp=tuple(msgspec.structs.replace(e, shared=None) for e in m.cp))
+
+
 def _reweighed(field: str, factor: float) -> Change:
     """Multiplies the covariances of one type of edge, which divides its information."""
 
@@ -130,7 +135,9 @@ def _reweighed(field: str, factor: float) -> Change:
         if not edges:
             return m
         wider = [
-            msgspec.structs.replace(e, cov=tuple(factor * c for c in e.cov))
+            inflated(e, factor)
+            if isinstance(e, LandmarkEdge)
+            else msgspec.structs.replace(e, cov=tuple(factor * c for c in e.cov))
             for e in (edges if isinstance(edges, tuple) else (edges,))
         ]
         return msgspec.structs.replace(m, **{field: tuple(wider) if isinstance(edges, tuple) else wider[0]})

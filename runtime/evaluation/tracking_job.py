@@ -42,10 +42,10 @@ from birdslam.frontend import EgoMotion, FrontEndConfig, Pending
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.paper import PAPER as AS_PUBLISHED
 from birdslam.perception import ModelSpec, Perception, Ready
-from birdslam.runtime.configuration import Configuration, ConfigurationError
+from birdslam.runtime.configuration import Configuration, ConfigurationError, complete
 from birdslam.runtime.models import store
 from birdslam.runtime.nodes.inference import Inference
-from birdslam.sources.kitti import find_images, read_image
+from birdslam.sources.kitti import KITTI_RATE_HZ, find_images, read_image
 from birdslam.sources.kitti_tracking import TrackingSequence, open_tracking, read_detections
 from birdslam.sources.recording import DatasetError
 from birdslam.sources.speed_file import of_sequence, read_speeds
@@ -266,20 +266,24 @@ def _log_maker(
 
     def make(seed: int, config: FrontEndConfig) -> list[Measurements]:
         perceive: Callable[[int, NDArray[np.uint8]], Pending] = given
+        frustum_network = lane_head = None
         if network:
-            configuration = job.configuration.as_lossless()
+            configuration = complete(job.configuration.as_lossless(), sequence.camera, KITTI_RATE_HZ)
             if config.pseudolidar.rule == "paper" and configuration.models.pointnet is None:  # Sec. 3.1.3
                 frustum = ModelSpec(path=str(store.find("pointnet", configuration.runtime.models_dir)))
                 models = msgspec.structs.replace(configuration.models, pointnet=frustum)
                 configuration = msgspec.structs.replace(configuration, models=models)
-            perceive = stack.enter_context(Inference(configuration)).networks.start
+            inference = stack.enter_context(Inference(configuration))
+            perceive = inference.networks.start
+            frustum_network, lane_head = inference.frustum_network, inference.lane_head
         odometry = _odometry(job, sequence, frames, np.random.default_rng([seed, *sequence.name.encode()]))
 
         def counted(frame: int, image: NDArray[np.uint8]) -> Pending:
             frame_made()
             return perceive(frame, image)
 
-        return make_log(sequence, frames, odometry, counted, image_of if looks else None, config, speeds)
+        looked = image_of if looks else None
+        return make_log(sequence, frames, odometry, counted, looked, config, speeds, frustum_network, lane_head)
 
     return make
 

@@ -61,7 +61,6 @@ def idea_variants() -> dict[str, Method]:
     default, paper = GraphConfig(), PAPER.graph
     alone = {
         "gates on outliers": ("detection_gate_sigma", "landmark_gate_sigma"),
-        "an error that all landmarks share": ("landmark_common_along_m", "landmark_common_across_m"),
         "landmarks where the last key frame saw them": ("landmark_anchor",),
         "standstill held": ("zero_velocity_update",),
         "a front that may be a back": ("front_back_ambiguity",),

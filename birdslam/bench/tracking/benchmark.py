@@ -6,6 +6,7 @@ differ in nothing else. Track ids are our own tracker's; a label's track in a fr
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -26,18 +27,26 @@ from birdslam.geometry.se2 import SE2
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
+from birdslam.mapping.lane_mapper import LaneHead
 from birdslam.paper import PAPER as AS_PUBLISHED
 from birdslam.slam import SlamConfig
 from birdslam.sources.kitti import KITTI_RATE_HZ
 from birdslam.sources.kitti_tracking import VEHICLE_KINDS, TrackingSequence
 from birdslam.sources.speed_log import SpeedLog
-from birdslam.types import NS_PER_S, Frame, LandmarkKind, Measurements
+from birdslam.types import NS_PER_S, Frame, LandmarkEdge, LandmarkKind, Measurements
+from birdslam.vehicles.placement.pseudolidar import FrustumNetwork
 from birdslam.vehicles.rts_smoother import RtsSmoother, SmootherConfig
 
 EGO = "ego"
 LEAST_FRAMES = 5  # a vehicle matched in fewer is left out of the report, unless the paper names it
 
 NO_IMAGE = np.zeros((1, 1), dtype=np.uint8)  # for an odometry that needs none
+
+
+def inflated(edge: LandmarkEdge, factor: float) -> LandmarkEdge:
+    """The edge with its own and its shared variances multiplied."""
+    shared = edge.shared and tuple(math.sqrt(factor) * v for v in edge.shared)
+    return replace(edge, cov=tuple(factor * v for v in edge.cov), shared=shared)
 
 
 @dataclass(frozen=True)
@@ -62,7 +71,7 @@ class Live:
         if self.cv_inflation == self.cp_inflation == 1.0:
             return m
         cv = [replace(e, cov=tuple(self.cv_inflation * v for v in e.cov)) for e in m.cv]
-        cp = [replace(e, cov=tuple(self.cp_inflation * v for v in e.cov)) for e in m.cp]
+        cp = [inflated(e, self.cp_inflation) for e in m.cp]
         return replace(m, cv=tuple(cv), cp=tuple(cp))
 
 
@@ -124,13 +133,15 @@ def make_log(
     images: Callable[[int], NDArray[np.uint8] | None] | None,
     config: FrontEndConfig,
     speeds: SpeedLog | None = None,
+    frustum_network: FrustumNetwork | None = None,
+    lane_head: LaneHead | None = None,
 ) -> list[Measurements]:
     """The front end's measurements of `frames`; frame ids are KITTI's.
 
     `images` gives a frame's image, None where it is unreadable; without `images` the odometry needs none. `speeds` are
-    the car's own, by the frames' time from 0 on.
+    the car's own, by the frames' time from 0 on. `frustum_network` and `lane_head` are those of `FrontEnd`.
     """
-    frontend, log = FrontEnd(sequence.camera, config, odometry), []
+    frontend, log = FrontEnd(sequence.camera, config, odometry, frustum_network, lane_head or LaneHead()), []
     for index in frames:
         image = NO_IMAGE if images is None else images(index)
         t_ns = round(index / KITTI_RATE_HZ * NS_PER_S)

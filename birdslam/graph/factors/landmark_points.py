@@ -24,38 +24,50 @@ from birdslam.types import LandmarkEdge, LandmarkKind
 
 LandmarkKey = tuple[LandmarkKind, int]  # each kind has ids of its own
 
+_NOTHING = 0.0, 0.0, 0.0, 0.0  # of a landmark that shares no error
+# What a frame's landmarks share lasts: correlated with itself by .42, .49, .34 from one key frame to the next and by
+# .40, .17, .21 to the one after (0005, 0002, 00): in a sum over key frames its variance counts 1 + 2 (r1 + r2) times
+SHARED_LASTS = 2.3
 _LEAST_VARIANCE_M2 = 1e-12  # a landmark without noise must not make the sum singular
 
 
 @dataclass(slots=True)
 class Sightings:
-    """The landmarks of one frame: points (N,) in ego, means (N,) and deviators (N,) of their covariances."""
+    """The landmarks of one frame: points (N,) in ego, means (N,) and deviators (N,) of their covariances.
+
+    `shared` (2, N): how far 1-sigma of the frame's pitch and of its height moves each, which is in these covariances.
+    """
 
     keys: list[LandmarkKey]
     points: Complexes
     means: Floats
     deviators: Complexes
+    shared: Complexes
 
     def __getitem__(self, rows: Rows | slice) -> Sightings:
         keys = self.keys[rows] if isinstance(rows, slice) else [self.keys[i] for i in rows.tolist()]
-        return Sightings(keys, self.points[rows], self.means[rows], self.deviators[rows])
+        return Sightings(keys, self.points[rows], self.means[rows], self.deviators[rows], self.shared[:, rows])
 
 
 def sightings(edges: tuple[LandmarkEdge, ...]) -> Sightings:
     """The CP edges as arrays, each landmark once (the last one counts).
 
-    An edge whose covariance is none (not positive definite) or whose numbers are no road's is left out.
+    An edge whose covariance is none (not positive definite), less than what it shares, or whose numbers are no road's
+    is left out.
     """
     latest = {(e.kind, e.landmark): e for e in edges}
     keys = list(latest)
-    flat = chain.from_iterable((e.x_m, e.y_m, *e.cov) for e in latest.values())
-    table = np.fromiter(flat, np.float64, 6 * len(keys)).reshape(-1, 6)
+    flat = chain.from_iterable((e.x_m, e.y_m, *e.cov, *(e.shared or _NOTHING)) for e in latest.values())
+    table = np.fromiter(flat, np.float64, 10 * len(keys)).reshape(-1, 10)
     if np.abs(table).max(initial=0.0) > LARGEST_M:
         sane = np.abs(table).max(axis=1) <= LARGEST_M
         keys, table = [key for key, keep in zip(keys, sane.tolist(), strict=True) if keep], table[sane]
-    x, y, xx, xy, _, yy = table.T
-    out = Sightings(keys, x + 1j * y, 0.5 * (xx + yy) + _LEAST_VARIANCE_M2, 0.5 * (xx - yy) + 1j * xy)
-    good = out.means > np.abs(out.deviators)
+    x, y, xx, xy, _, yy = table.T[:6]
+    shared = table.T[6:8] + 1j * table.T[8:]
+    out = Sightings(keys, x + 1j * y, 0.5 * (xx + yy) + _LEAST_VARIANCE_M2, 0.5 * (xx - yy) + 1j * xy, shared)
+    good = out.means - 0.5 * (shared * shared.conj()).real.sum(axis=0) > np.abs(
+        out.deviators - 0.5 * (shared * shared).sum(axis=0)
+    )
     return out if good.all() else out[np.flatnonzero(good)]
 
 
@@ -68,17 +80,30 @@ def landmark_residual(points: Complexes, node: complex, heading: complex, anchor
     return points - node - heading * anchored  # Eq. 3
 
 
-def sum_of_points(residuals: Complexes, means: Floats, deviators: Complexes) -> tuple[complex, float, complex]:
+def sum_of_points(
+    residuals: Complexes, means: Floats, deviators: Complexes, shared: Complexes
+) -> tuple[complex, float, complex]:
     """N >= 1 unary edges on one translation as one: their centroid weighted by information, and its covariance.
 
-    Exact: the sum over p of the costs of t - residual_p, and the cost of t - centroid, differ by a constant in t.
+    Where they share nothing it is exact: the sum over p of the costs of t - residual_p, and the cost of t - centroid,
+    differ by a constant in t. An error that moves the points by a row of `shared` (K, N) moves the centroid by their
+    weighted mean, which no number of points averages away.
     """
     det = means * means - (deviators * deviators.conj()).real
     information, deviation = means / det, -deviators / det
     moment = complex((information * residuals + deviation * residuals.conj()).sum())  # Eq. 7, and its two sums below
     m, d = float(information.sum()), complex(deviation.sum())
     det_sum = m * m - abs(d) ** 2
-    return (m * moment - d * moment.conjugate()) / det_sum, m / det_sum, -d / det_sum
+    centroid = (m * moment - d * moment.conjugate()) / det_sum
+    each = information * shared + deviation * shared.conj()
+    together = each.sum(axis=1)
+    # Of the weighted sum of residuals: m and d, with what is shared added up as a whole in place of point by point
+    more = 0.5 * (SHARED_LASTS * np.vdot(together, together).real - np.vdot(each, each).real)
+    turned = 0.5 * complex(SHARED_LASTS * (together * together).sum() - (each * each).sum())
+    C, D = m / det_sum, -d / det_sum
+    spread, skew = C * C + abs(D) ** 2, 2.0 * C * D
+    mean = C + spread * more + (skew * turned.conjugate()).real
+    return centroid, mean, D + skew * more + C * C * turned + D * D * turned.conjugate()
 
 
 class LandmarksState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -105,9 +130,6 @@ class LandmarkPoints(Factor):
         self._capacity = config.max_landmarks
         self._in_world = config.landmark_anchor == "first_sight"
         self._gate = config.landmark_gate_sigma**2
-        # Mean and deviator of what all landmarks of a frame share, m^2
-        along, across = config.landmark_common_along_m**2, config.landmark_common_across_m**2
-        self._common = 0.5 * (along + across), 0.5 * (along - across)
         self._least_frames = config.landmark_least_frames
         self.begin()
 
@@ -161,7 +183,7 @@ class LandmarkPoints(Factor):
         now, then = self._known(seen)
         if not len(now):
             return None
-        points, means, deviators = seen.points[now], seen.means[now], seen.deviators[now]
+        points, means, deviators, shared = seen.points[now], seen.means[now], seen.deviators[now], seen.shared[:, now]
         if self._in_world:
             place, node_cov = EGO_PLACE, window.ego_cov[:2, :2]
             there, off = self._in_ego(then, window)
@@ -172,14 +194,14 @@ class LandmarkPoints(Factor):
             residuals = landmark_residual(points, node, heading, self._anchored.points[then])  # Eq. 3
             means = means + self._anchored.means[then]
             deviators = deviators + heading * heading * self._anchored.deviators[then]
+            shared = np.concatenate([shared, heading * self._anchored.shared[:, then]])
         # An outlier is one for which the node's own uncertainty does not account either
         (xx, xy), (_, yy) = node_cov.tolist()
         distances = point_costs(residuals, means + 0.5 * (xx + yy), deviators + complex(0.5 * (xx - yy), xy))  # Eq. 5
         if distances.max() > self._gate:
             excess = inflation(distances, self._gate)
-            means, deviators = means * excess, deviators * excess
-        gap, m, d = sum_of_points(residuals, means, deviators)  # Eq. 7
-        m, d = m + self._common[0], d + self._common[1]
+            means, deviators, shared = means * excess, deviators * excess, shared * np.sqrt(excess)
+        gap, m, d = sum_of_points(residuals, means, deviators, shared)  # Eq. 7
         return Linearised([gap.real, gap.imag], place, np.array([[[m + d.real, d.imag], [d.imag, m - d.real]]]))
 
     def known_in_ego(self, window: Window) -> tuple[Complexes, Complexes, complex] | None:
@@ -223,7 +245,7 @@ class LandmarkPoints(Factor):
         if self._in_world:
             places = at + seen.points * cmath.exp(1j * self._yaw_rad)
             places[old] = self._anchored.points[before]
-            seen = Sightings(seen.keys, places, seen.means, seen.deviators)
+            seen = Sightings(seen.keys, places, seen.means, seen.deviators, seen.shared)
         frames = np.ones(len(seen.keys), dtype=np.int64)
         for sums, so_far in ((information, self._information), (moment, self._moment), (frames, self._frames)):
             sums[old] += so_far[before]

@@ -1,4 +1,4 @@
-"""Age at the planner and the optimizer's time with the map process at work and without it, in turn on one machine."""
+"""Age at the planner and its parts with the map process, or lanes, at work and without, in turn on one machine."""
 
 from __future__ import annotations
 
@@ -17,31 +17,37 @@ from birdslam.runtime.transport.bus import Message
 
 Split = Callable[[Sequence[Message]], dict[str, Floats]]
 
-OPTIMIZER = "optimize"
-COMPARED = ("age", "p50"), ("age", "p99"), ("optimize", "p50"), ("optimize", "p99")
+STEPS = "perceive", "optimize"
+COMPARED = tuple((what, at) for what in ("age", *STEPS) for at in ("p50", "p99"))
+NEVER = 1_000_000  # frames: lanes are made out of the first alone
 
 
-def measure(ledger: Ledger, ask: Ask, pairs: int, split: Split, warm_up_s: float) -> None:
+def settings_of(part: str, folder: Path) -> dict[str, tuple[str, ...]]:
+    """The settings without and with "map" or "lanes"."""
+    if part == "map":
+        return {"without": (), "with": (f"results.map={folder / 'street.map'}",)}
+    return {"without": (f"perceive.schedule.lanes.every={NEVER}", "models.completion=false"), "with": ()}
+
+
+def measure(ledger: Ledger, ask: Ask, part: str, pairs: int, split: Split, warm_up_s: float) -> None:
     """So many runs of each, the order turned from pair to pair; then the median of with over without.
 
     `split`: milliseconds of each part of the messages' ages.
     """
     rows: list[dict[str, dict[str, Any]]] = []
-    with tempfile.TemporaryDirectory(prefix="perf-map") as folder:
-        kept = f"results.map={Path(folder) / 'street.map'}"
+    with tempfile.TemporaryDirectory(prefix="perf-turns") as folder:
+        settings = settings_of(part, Path(folder))
         for pair in range(pairs):
             rows.append({})
             for name in ("without", "with") if pair % 2 == 0 else ("with", "without"):
-                settings = (*ask.settings, kept) if name == "with" else ask.settings
-                with drive(msgspec.structs.replace(ask, settings=settings)) as run:
+                with drive(msgspec.structs.replace(ask, settings=(*ask.settings, *settings[name]))) as run:
                     row = rows[-1][name] = _figures(run.after(warm_up_s), split)
-                age, optimize = row["age_ms"], row["optimize_ms"]
-                looked = f", {row['looks']} images looked at" if name == "with" else ""
-                text = (
-                    f"age p50 {age['p50']:.1f} p99 {age['p99']:.1f} ms; optimizer p50 {optimize['p50']:.2f} "
-                    f"p99 {optimize['p99']:.2f} ms; {row['dropped']} dropped{looked}"
+                text = "; ".join(
+                    f"{what} p50 {row[f'{what}_ms']['p50']:.2f} p99 {row[f'{what}_ms']['p99']:.2f} ms"
+                    for what in ("age", *STEPS)
                 )
-                ledger.add(f"{pair + 1}: {name} the map process", text, **row)
+                looked = f", {row['looks']} images looked at" if row["looks"] else ""
+                ledger.add(f"{pair + 1}: {name} {part}", f"{text}; {row['dropped']} dropped{looked}", **row)
     over = {
         f"{what} {at}": [round(pair["with"][f"{what}_ms"][at] / pair["without"][f"{what}_ms"][at], 3) for pair in rows]
         for what, at in COMPARED
@@ -55,9 +61,10 @@ def measure(ledger: Ledger, ask: Ask, pairs: int, split: Split, warm_up_s: float
 def _figures(run: Run, split: Split) -> dict[str, Any]:
     summary, parts = run.summary, split(run.messages)
     age_ms = [(message.t_received_ns - message.record.t_capture_ns) / 1e6 for message in run.messages]
+    steps = {f"{step}_ms": spread(parts[step][~np.isnan(parts[step])]) for step in STEPS}
     return {
         "age_ms": spread(age_ms),
-        "optimize_ms": spread(parts[OPTIMIZER][~np.isnan(parts[OPTIMIZER])]),
+        **steps,
         "dropped": summary["frames_dropped"],
         "looks": summary["map"]["looks"] if "map" in summary else 0,
     }
