@@ -3,11 +3,9 @@
     python -m perf people_scenes [child crowd standing] [--people 25] [--rate 33] [--light day|evening|rain|night]
                                   [--noise 1] [--output F.json]
 
-The whole method runs in this process on the rendered images, with boxes of the truth's outlines and a detector's noise
-(birdslam/world/people_scenes.py), or so much of it. The child: seconds from its first pixel to a valid record of it,
-and whether the hidden fans held it before. The others: errors against exact truth, tracks within 2 m, and by the bodies
-whose boxes they took (`of boxes`), which places do not change; a core's milliseconds a frame.
-"""
+The whole method on rendered images, with boxes of the truth's outlines and a detector's noise. The child: seconds from
+its first pixel to a valid record, and whether the hidden fans held it. Others: errors, tracks within 2 m and by whose
+boxes they took (`of_boxes`), ms a frame."""
 
 from __future__ import annotations
 
