@@ -20,7 +20,7 @@ from birdslam.runtime.supervision.final_results import rows as final_rows
 from birdslam.sources.opening import open_recording
 from birdslam.sources.shipped_drive import DemoRecording
 from birdslam.trajectory import as_poses, inverse, split_pose
-from birdslam.types import IN_SIGHT_NS, Estimate, VehicleEstimate
+from birdslam.types import IN_SIGHT_NS, Estimate, Moves, VehicleEstimate
 
 FRAMES = range(0, 90, 3)
 COV = (0.0,) * 9
@@ -152,7 +152,7 @@ def test_a_run_leaves_a_video_and_its_figures(demo: DemoRecording, truthful: lis
         report.add(estimate)
     summary = {"truth": msgspec.to_builtins(report.grade()), **FinalResults(configuration, report).write(())}
     told = [name for name, _ in (*rows(summary), *final_rows(summary))]
-    assert told == ["ATE of the ego", "ATE of vehicles", "  from the ego", "video"]
+    assert told == ["ATE of the ego", "ATE of vehicles", "  from the ego", "movers", "video"]
     video = cv2.VideoCapture(summary["video"])
     shown, picture = video.read()
     video.release()
@@ -175,3 +175,34 @@ def test_the_picture_shows_vehicles_in_both_views(demo: DemoRecording, truthful:
 def test_a_run_without_truth_or_without_end_has_no_report(settings: dict[str, object]) -> None:
     assert DemoReport.of(load(None, settings)) is None
     assert rows({}) == []
+
+
+def test_movers_are_judged_against_the_truth_at_whatever_range_they_stand(demo: DemoRecording) -> None:
+    """What moves is reported to drive, what stands is not; then all of it, at a third too far."""
+
+    def told(everything: bool, factor: float) -> DemoGrade:
+        estimates = []
+        for k, ego in enumerate(true_egos(demo)[:90]):
+            vehicles = tuple(
+                VehicleEstimate(
+                    vehicle=body.body, cov=COV, velocity_cov=(0.0,) * 4, age_ns=0, frames=1,
+                    T_world_vehicle=ego @ SE2(factor * body.T_ego_body.x_m, factor * body.T_ego_body.y_m),
+                    velocity_mps=(5.0, 0.0), length_m=body.length_m, width_m=body.width_m,
+                    moves=Moves.DRIVING if everything or math.hypot(*body.velocity_mps) > 1.0 else Moves.STANDING,
+                )
+                for body in demo.truth_bodies(k)
+                if body.label in VEHICLES
+            )  # fmt: skip
+            estimates.append(
+                Estimate(
+                    epoch=0, frame_id=k, t_source_ns=0, t_capture_ns=0, t_utc_ns=0, T_world_ego=ego, cov=COV,
+                    valid=True, vehicles=vehicles,
+                )
+            )  # fmt: skip
+        return grade(demo, estimates)
+
+    right, wrong = told(False, 1.0), told(True, 1.33)
+    assert right.standing > 3
+    assert right.driving > 1
+    assert (right.false_movers, right.missed_movers, right.movers_soon) == (0, 0, right.driving)
+    assert wrong.false_movers > 0.8 * right.standing

@@ -12,7 +12,9 @@ pytest.importorskip("numba", reason="the built-in world is rendered with numba (
 
 from birdslam.perf.perception.people_scenes import Step, driven, in_a_fan, of_child, true_place
 from birdslam.types import PEOPLE
-from birdslam.world.people_scenes import child_steps_out, crowd
+from birdslam.world.people_scenes import CAMERA, child_steps_out, crowd, lit
+from birdslam.world.rendering import materials as m
+from birdslam.world.scenario import drive
 from birdslam.world.traffic.flow import advance
 
 RATE_HZ, COUNT = 20.0, 60
@@ -52,6 +54,21 @@ def _ahead(step: Step) -> bool:
 @pytest.mark.slow
 def test_nobody_is_in_a_fan_where_the_road_is_free(steps: list[Step]) -> None:
     assert not any(in_a_fan(step.estimate, np.array([x_m, 1.0])) for step in steps for x_m in (4.0, 8.0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("light", ["day", "rain", "night"])
+def test_some_push_prams_in_every_light(light: str) -> None:
+    """Who goes across with a pram is a wider outline."""
+    assert [k for k, mover in enumerate(crowd(5).movers) if mover.body.parameters[m.GLOSS] > 0.5] == [4]
+    widths = []
+    for pushes in (1.0, 0.0):
+        scene = lit(crowd(5), light)
+        walker = scene.movers[4]
+        walker.turn_rad, walker.walks, walker.body.parameters[m.GLOSS] = np.pi / 2, [], pushes
+        (frame,) = drive(scene, CAMERA, 1, RATE_HZ, 1)
+        widths.append(np.ptp(np.nonzero(frame.instances == 5)[1]))
+    assert widths[0] > 1.5 * widths[1]
 
 
 def test_people_wait_set_out_and_turn_back_at_their_times() -> None:

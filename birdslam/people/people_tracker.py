@@ -26,7 +26,8 @@ from birdslam.vehicles.placement.localisation import iou
 from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
 
 NEVER = 1e9  # the cost of what can't be
-NEW = 2.0  # -2 log of the density of new people in bearing, slope and log height: about one in the image
+NEW_PER_S = 1.0  # how many new people a second begin, in a unit of bearing, slope and log height: about the image
+MIN_DT_S = 1e-3
 SIDE_MARGIN = 0.03  # of the image's width: who is predicted farther outside has left
 UNKNOWN_MPS = 10.0  # an ego of unknown motion is taken to drive
 LEAVES_S = 0.3  # until who left the image is forgotten
@@ -130,21 +131,24 @@ class PeopleTracker:
         if not boxes or not self.tracks:
             return []
         squared, costs = self.filter.distances(boxes, frame.ego.T_world_ego, height_m)
-        costs += self._sight(frame.dt_s) + self._classes(boxes) + self._shapes(boxes, frame.ego.t_source_ns)
+        t_ns = frame.ego.t_source_ns
+        since_s = max((t_ns - max(track.seen_ns for track in self.tracks)) * 1e-9, MIN_DT_S)  # anybody had a box
+        costs += self._sight(since_s) + self._classes(boxes) + self._shapes(boxes, t_ns)
         cost = np.where(squared <= self.config.gate, costs, NEVER)
-        births = np.where(np.eye(len(boxes)), NEW, NEVER)  # a row of somebody new for each box
+        new = -2.0 * math.log(NEW_PER_S * since_s)
+        births = np.where(np.eye(len(boxes)), new, NEVER)  # a row of somebody new for each box
         rows, columns = self._assign(np.vstack([cost, births]))
         known = len(self.tracks)
         return [
             (int(i), int(j)) for i, j in zip(rows, columns, strict=True) if i < known and cost[i, j] < NEVER
         ]  # fmt: skip
 
-    def _sight(self, dt_s: float) -> Floats:
-        """(N,): -2 log of the odds that each has a box. Who was seen in the last frame is so again, and who was not is
-        hidden still (a Markov chain), so that nobody hidden takes the box of who is in front.
+    def _sight(self, since_s: float) -> Floats:
+        """(N, 1): -2 log of the odds that each has a box. Who had one in the last frame has one again, and who had none
+        is hidden still (a Markov chain), so that nobody hidden takes the box of who is in front.
         """
-        lost = -math.expm1(-dt_s / self.config.seen_for_s)
-        found = -math.expm1(-dt_s / self.config.hidden_for_s)
+        lost = -math.expm1(-since_s / self.config.seen_for_s)
+        found = -math.expm1(-since_s / self.config.hidden_for_s)
         last = max(track.seen_frame for track in self.tracks)
         again = np.where([track.seen_frame == last for track in self.tracks], 1.0 - lost, found)
         return np.asarray(-2.0 * np.log(again / (1.0 - again)))[:, None]
@@ -160,14 +164,13 @@ class PeopleTracker:
         """(N, M): -2 log of how likely each box has its width over its height after the last one of each, against one
         of anybody: limbs swing, and what is in front covers them (Student's t).
         """
-        config = self.config
-        last, now = ([b.log_width - math.log(max(b.tan_height, MIN_SLOPE)) for b in of]
-                     for of in ([track.box for track in self.tracks], boxes))  # fmt: skip
+        config, before = self.config, [track.box for track in self.tracks]
+        last, now = ([box.log_width - math.log(max(box.tan_height, MIN_SLOPE)) for box in of] for of in (before, boxes))
         unseen_s = np.array([(t_ns - track.seen_ns) * 1e-9 for track in self.tracks])[:, None]
         variance = config.sigma_shape**2 - config.sigma_stride**2 * np.expm1(-unseen_s / config.stride_s)
         squared = np.square(np.subtract.outer(last, now)) / variance
         cost = (SHAPE_DOF + 1.0) * np.log1p(squared / SHAPE_DOF) + np.log(variance / config.sigma_shapes**2)
-        same = np.equal.outer([track.box.label for track in self.tracks], [box.label for box in boxes])
+        same = np.equal.outer([box.label for box in before], [box.label for box in boxes])
         return np.where(same, cost, 0.0)
 
     def _begin(self, boxes: list[PersonBox], matched: set[int], frame: OpenFrame, height_m: float) -> None:

@@ -1,12 +1,14 @@
 """Scenes of people on a straight street: a child steps out between parked cars, a crowd, people who stand.
 
-They walk along and across, wait and set out, cycle along and across; the truth is the world's own (truth.py). `boxes`
-are what a detector would say of it: the outline of what is seen of each body, with noise.
+They walk along and across, wait and set out, push prams, cycle along and across, by day, night and rain; the truth is
+the world's own (truth.py). `boxes` are what a detector would say of it: the outline of what is seen of each body, with
+noise.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,11 +16,14 @@ from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.world.demo_world import demo_lens, demo_sky
 from birdslam.world.rendering import materials as m
+from birdslam.world.rendering.night import Night
+from birdslam.world.roads import dark_camera
 from birdslam.world.scenario import Scenario
 from birdslam.world.street.course import STEP_M, Course
 from birdslam.world.street.street import Street
 from birdslam.world.street.street_plan import draw_street
-from birdslam.world.traffic.fleet import draw_cyclist, draw_pedestrian, draw_shape
+from birdslam.world.town import sky_of
+from birdslam.world.traffic.fleet import draw_cyclist, draw_pedestrian, draw_shape, give_pram
 from birdslam.world.traffic.flow import Mover
 from birdslam.world.traffic.placement import furnish
 from birdslam.world.traffic.poses import place
@@ -53,7 +58,7 @@ def crowd(people: int = 25, ego_mps: float = 2.0, vehicles: int = 0) -> Scenario
     """So many people before a slow ego, and so many standing vehicles.
 
     People walk along the street or across it and turn back after some seconds, some wait before they set out, one in
-    six cycles.
+    six cycles, one in eight pushes a pram.
     """
     rng, street = _street()
     movers: list[Mover] = []
@@ -65,6 +70,8 @@ def crowd(people: int = 25, ego_mps: float = 2.0, vehicles: int = 0) -> Scenario
         goes_s = float(rng.uniform(3.0, 5.0))
         walks = [(waits_s + goes_s * leg, turn + math.pi * (leg % 2), speed) for leg in range(20)]
         body, phase = (draw_cyclist(rng), _CYCLE) if cycles else (draw_pedestrian(rng), _WALK)
+        if k % 8 == 4 and not cycles:
+            body = give_pram(body)
         movers.append(Mover(body, s, d, turn, 0.0, phase_per_m=phase, walks=walks))
     for k in range(vehicles):
         side = street.right_m + 1.0 if k % 2 else street.left_m - 1.0
@@ -82,9 +89,21 @@ def people_stand(ego_mps: float = 8.0) -> Scenario:
     return _scenario(rng, street, movers, ego_mps)
 
 
-def boxes(frame: WorldFrame, rng: np.random.Generator) -> tuple[Floats, list[str], Floats]:
-    """Boxes (N, 4) in px, labels of detectors and scores (N,) of whom a detector would find in a frame."""
-    found, labels, scores = [], [], []
+def lit(scenario: Scenario, light: str) -> Scenario:
+    """The scene by day, evening, rain or night."""
+    if light == "night":
+        return replace(scenario, sky=sky_of(light), lens=dark_camera(), night=Night())
+    return replace(scenario, sky=sky_of(light))
+
+
+def boxes(
+    frame: WorldFrame, rng: np.random.Generator, noise: float = 1.0
+) -> tuple[Floats, list[str], Floats, list[int]]:
+    """Whom a detector would find in a frame: boxes (N, 4) in px, labels, scores (N,), and which bodies they are.
+
+    `noise` scales the errors of the edges.
+    """
+    found, labels, scores, bodies = [], [], [], []
     for body in frame.objects:
         y, x = np.nonzero(frame.instances == body.object_id + 1)
         if body.visible < LEAST_SEEN or not len(x):
@@ -93,11 +112,12 @@ def boxes(frame: WorldFrame, rng: np.random.Generator) -> tuple[Floats, list[str
         height = box[3] - box[1]
         if height < LEAST_PX:
             continue
-        box += rng.normal(0.0, math.hypot(BOX_SIGMA_REL * height, BOX_SIGMA_PX), 4)
+        box += noise * rng.normal(0.0, math.hypot(BOX_SIGMA_REL * height, BOX_SIGMA_PX), 4)
         found.append(np.clip(box, 0.0, [frame.camera.width_px, frame.camera.height_px] * 2))
         labels.append("person" if body.label == "pedestrian" else body.label)
         scores.append(0.5 + 0.45 * body.visible)
-    return np.reshape(found, (-1, 4)), labels, np.array(scores)
+        bodies.append(body.object_id)
+    return np.reshape(found, (-1, 4)), labels, np.array(scores), bodies
 
 
 def _street() -> tuple[np.random.Generator, Street]:

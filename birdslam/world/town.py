@@ -93,7 +93,7 @@ def scenario(planned: TownDrive) -> Scenario:
     ego = Mover(draw_shape(rng, "estate"), planned.begin_m, own.d_m, 0.0, SPEED_MPS, SPEED_MPS, own.d_m)
     night = planned.light == "night"
     return Scenario(
-        road, built.plus(parked), tuple(_traffic(rng, road, planned.begin_m, own.d_m)), ego, _sky(planned.light),
+        road, built.plus(parked), tuple(_traffic(rng, road, planned.begin_m, own.d_m)), ego, sky_of(planned.light),
         dark_camera() if night else demo_lens(), planned.seed, AXLE_M, Night() if night else None,
     )  # fmt: skip
 
@@ -179,7 +179,8 @@ def _traffic(rng: np.random.Generator, street: Street, begin_m: float, own_d_m: 
             at += float(rng.uniform(50.0, 160.0))
 
 
-def _sky(light: str) -> Floats:
+def sky_of(light: str) -> Floats:
+    """Of day, evening, rain or night."""
     if light == "night":
         return even_sky(0.25)
     sky = demo_sky()

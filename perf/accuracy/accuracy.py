@@ -36,7 +36,7 @@ from birdslam.trajectory import as_poses, read_kitti
 label = "errors of ego, vehicles and places offline, beside the live run under real-time load"
 
 EGO = ("ate_m", "ate_se3_m", "scale_error", "rpe_t_m", "rpe_r_deg")
-VEHICLES = ("vehicle_ate_m", "vehicle_centre_rel", "found", "reported")
+VEHICLES = ("vehicle_ate_m", "vehicle_centre_rel", "found", "reported", "false_movers", "missed_movers")
 COLUMNS = (*EGO, *VEHICLES)
 SEQUENCES = "0000,0001,0002,0003,0004,0005,0006,0008"  # of KITTI tracking, with detections
 SEEDS = 2  # of the simulated odometry

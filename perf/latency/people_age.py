@@ -79,7 +79,7 @@ def render(place: Path, people: int, vehicles: int, rate_hz: float, count: int) 
 
     def with_boxes() -> Iterator[WorldFrame]:
         for frame in frames:
-            for box, name, score in zip(*boxes(frame, rng), strict=True):
+            for box, name, score, _ in zip(*boxes(frame, rng), strict=True):
                 corners = " ".join(f"{edge:.2f}" for edge in box)
                 kind = KITTI_TYPES.get(name, "Car")
                 lines.append(f"{frame.frame_id} -1 {kind} 0 0 0 {corners} 0 0 0 0 0 0 0 {score:.3f}")

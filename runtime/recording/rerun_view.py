@@ -83,8 +83,10 @@ class Viewer:
             return
         self.at(measurements.frame_id, measurements.t_source_ns)
         if not between_looks(measurements):
-            boxes = np.array([edge.box_px for edge in measurements.cv]).reshape(-1, 4)
-            labels = [f"{edge.label} {edge.vehicle}" for edge in measurements.cv]
+            seen = [(edge.box_px, edge.label, edge.vehicle) for edge in measurements.cv]
+            seen += [(p.box_px, p.label, p.person) for p in measurements.people if p.age_ns == 0]
+            boxes = np.array([box_px for box_px, _, _ in seen]).reshape(-1, 4)
+            labels = [f"{label} {body}" for _, label, body in seen]
             shown = rr.Boxes2D(array=boxes, array_format=rr.Box2DFormat.XYXY, labels=labels, colors=SEEN)
             self._stream.log("camera/boxes", shown)
         lanes = np.array([(p.x_m, p.y_m) for p in measurements.lanes]).reshape(-1, 2)

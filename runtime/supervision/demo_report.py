@@ -84,4 +84,10 @@ def rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
             f"median; {number(found.reported, '.0%')} of those in clear sight reported, "
             f"{number(found.found, '.0%')} seen in that very frame",
         ),
+        (
+            "movers",
+            f"{found.false_movers} of {found.standing} tracks of standing vehicles reported to drive; of "
+            f"{found.driving} of driving ones {found.driving - found.missed_movers}, "
+            f"{found.movers_soon} of them within 1 s",
+        ),
     ]

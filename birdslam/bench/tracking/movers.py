@@ -22,6 +22,8 @@ from birdslam.types import Estimate, Measurements, Moves, VehicleEstimate
 LEAST_SIGHTS = 5  # of a known speed: a track of fewer is not judged
 SOON_S = 1.0
 
+Sight = tuple[int, float, VehicleEstimate]  # frame, true speed over the ground in m/s, and what was estimated
+
 
 class FalseMover(msgspec.Struct, frozen=True, kw_only=True):
     """A standing vehicle at the first sight at which it was reported to drive."""
@@ -52,7 +54,7 @@ def movers_row(
 ) -> MoversRow:
     """Of a log and the estimates after each of its records."""
     speeds = label_speeds_mps(sequence)
-    sights: dict[tuple[int, int], list[tuple[int, float, VehicleEstimate]]] = defaultdict(list)
+    sights: dict[tuple[int, int], list[Sight]] = defaultdict(list)
     for record, estimate in zip(log, estimates, strict=True):
         by_id = {vehicle.vehicle: vehicle for vehicle in estimate.vehicles}
         edges = {edge.vehicle: edge for edge in record.cv if edge.vehicle in by_id}
@@ -62,9 +64,9 @@ def movers_row(
             if (label, record.frame_id) in speeds:
                 seen = record.frame_id, speeds[label, record.frame_id], by_id[vehicle]
                 sights[vehicle, label].append(seen)
-    standing = {key: seen for key, seen in sights.items() if len(seen) >= LEAST_SIGHTS and _stands(seen)}
+    standing = {key: seen for key, seen in sights.items() if len(seen) >= LEAST_SIGHTS and stands(seen)}
     found = [_false_mover(sequence, *key, seen) for key, seen in standing.items()]
-    delays = [_delay_s(seen) for seen in sights.values() if len(seen) >= LEAST_SIGHTS]
+    delays = [delay_s(seen, KITTI_RATE_HZ) for seen in sights.values() if len(seen) >= LEAST_SIGHTS]
     driving = [delay for delay in delays if delay is not None]
     return MoversRow(
         sequence=sequence.name,
@@ -97,13 +99,12 @@ def is_reported_driving(vehicle: VehicleEstimate) -> bool:
     return vehicle.moves is Moves.DRIVING and math.hypot(*vehicle.velocity_mps) > REPORTED_DRIVING_MPS
 
 
-def _stands(seen: Sequence[tuple[int, float, VehicleEstimate]]) -> bool:
+def stands(seen: Sequence[Sight]) -> bool:
+    """Whether the vehicle of a track's sights stands in all of them."""
     return all(speed < STANDS_MPS for _, speed, _ in seen)
 
 
-def _false_mover(
-    sequence: TrackingSequence, vehicle: int, label: int, seen: Sequence[tuple[int, float, VehicleEstimate]]
-) -> FalseMover | None:
+def _false_mover(sequence: TrackingSequence, vehicle: int, label: int, seen: Sequence[Sight]) -> FalseMover | None:
     reported = [(frame, estimate) for frame, _, estimate in seen if is_reported_driving(estimate)]
     if not reported:
         return None
@@ -121,10 +122,10 @@ def _false_mover(
     )
 
 
-def _delay_s(seen: Sequence[tuple[int, float, VehicleEstimate]]) -> float | None:
+def delay_s(seen: Sequence[Sight], rate_hz: float) -> float | None:
     """From the first sight of it driving until it is reported so, inf: never; None: it never drove for as long."""
     drives = [frame for frame, speed, _ in seen if speed > DRIVES_MPS]
-    if len(drives) < SOON_S * KITTI_RATE_HZ:
+    if len(drives) < SOON_S * rate_hz:
         return None
     reported = [frame for frame, _, estimate in seen if frame >= drives[0] and is_reported_driving(estimate)]
-    return (reported[0] - drives[0]) / KITTI_RATE_HZ if reported else math.inf
+    return (reported[0] - drives[0]) / rate_hz if reported else math.inf

@@ -15,9 +15,11 @@ import numpy as np
 from birdslam.bench.ego.trajectory_errors import compare, from_first
 from birdslam.bench.figures import median
 from birdslam.bench.tracking.metrics import least_cost, path_errors
+from birdslam.bench.tracking.movers import LEAST_SIGHTS, SOON_S, Sight, delay_s, is_reported_driving, stands
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.se2 import SE2
+from birdslam.sources.kitti import KITTI_RATE_HZ
 from birdslam.sources.shipped_drive import DemoRecording, TrueBody
 from birdslam.trajectory import CameraTrajectory, as_poses, ego_pose, inverse, mount_pose, split_pose
 from birdslam.types import Estimate, VehicleEstimate
@@ -25,6 +27,7 @@ from birdslam.types import Estimate, VehicleEstimate
 VEHICLES = ("car", "van", "truck", "bus")
 ASKED_VISIBLE, ASKED_TRUNCATED, ASKED_RANGE_M = 0.5, 0.2, (4.0, 40.0)  # bodies that are to be found
 GATE_M, GATE_REL = 2.0, 0.2  # a vehicle further from a body than the greater of the two (of its range) is another's
+LEAST_VISIBLE, MOST_LOG_RANGE = 0.15, 0.6  # of what a mover is judged by: part in view, and 1.8 times as far off
 LEAST_FRAMES = 10  # a body matched in fewer is not counted as a vehicle
 
 
@@ -42,6 +45,12 @@ class DemoGrade(msgspec.Struct, frozen=True, kw_only=True):
     vehicle_centre_rel: float | None  # the same over the body's range
     found: float | None  # share of the bodies in clear sight (ASKED_...), frame by frame, that were matched
     reported: float | None = None  # the same with vehicles that the last looks showed, predicted to the frame
+    # Tracks, one of our ids on one body, judged as `birdslam evaluate tracking` does (movers.py)
+    standing: int = 0
+    false_movers: int = 0  # of these, reported to drive
+    driving: int = 0  # for a second or longer
+    missed_movers: int = 0  # of these, never reported to
+    movers_soon: int = 0  # of these, reported to within a second
 
 
 class GlobalFrame:
@@ -86,6 +95,7 @@ def grade(recording: DemoRecording, estimates: Sequence[Estimate]) -> DemoGrade:
     paths: dict[int, dict[int, SE2]] = {}
     errors: list[tuple[float, float]] = []  # distance, range
     asked = found = reported = 0
+    tracks: dict[tuple[int, int], list[Sight]] = {}
     for estimate in estimates:
         k = estimate.frame_id
         cameras.append(trajectory.add(estimate.epoch, ego_pose(estimate.T_world_ego, estimate.attitude)))
@@ -97,6 +107,8 @@ def grade(recording: DemoRecording, estimates: Sequence[Estimate]) -> DemoGrade:
             errors.append((math.hypot(seen.x_m - true.x_m, seen.y_m - true.y_m), math.hypot(true.x_m, true.y_m)))
             true_paths.setdefault(body.body, {})[k] = egos[k] @ true
             paths.setdefault(body.body, {})[k] = T_true_world @ vehicle.T_world_vehicle
+        for body, vehicle in match_by_bearing(estimate, bodies):
+            tracks.setdefault((vehicle.vehicle, body.body), []).append((k, math.hypot(*body.velocity_mps), vehicle))
         clear = {body.body for body in bodies if in_clear_sight(body)}
         asked += len(clear)
         found += len(clear & {body.body for body, _ in matched})
@@ -121,7 +133,22 @@ def grade(recording: DemoRecording, estimates: Sequence[Estimate]) -> DemoGrade:
         vehicle_centre_rel=median(distance / reach),
         found=found / asked if asked else None,
         reported=reported / asked if asked else None,
+        **_movers(list(tracks.values()), recording.rate_hz),
     )
+
+
+def _movers(tracks: Sequence[Sequence[Sight]], rate_hz: float) -> dict[str, int]:
+    """The fields of a grade that count tracks."""
+    long_enough = [seen for seen in tracks if len(seen) >= LEAST_SIGHTS / KITTI_RATE_HZ * rate_hz]
+    standing = [seen for seen in long_enough if stands(seen)]
+    delays = [delay for seen in long_enough if (delay := delay_s(seen, rate_hz)) is not None]
+    return {
+        "standing": len(standing),
+        "false_movers": sum(any(is_reported_driving(v) for _, _, v in seen) for seen in standing),
+        "driving": len(delays),
+        "missed_movers": sum(math.isinf(delay) for delay in delays),
+        "movers_soon": sum(delay <= SOON_S for delay in delays),
+    }
 
 
 def in_clear_sight(body: TrueBody) -> bool:
@@ -145,3 +172,24 @@ def match(
     distance = np.linalg.norm(goal[:, None] - at[None], axis=2) / gates_m[:, None]
     rows, columns = least_cost(np.minimum(distance, 1.0))
     return [(bodies[i], seen[j]) for i, j in zip(rows, columns, strict=True) if distance[i, j] < 1.0]
+
+
+def match_by_bearing(estimate: Estimate, bodies: Sequence[TrueBody]) -> list[tuple[TrueBody, VehicleEstimate]]:
+    """Pairs of bodies and of vehicles seen in this frame that lie in one direction, whatever their range is off by.
+
+    What is reported to drive falsely often stands at a wrong range.
+    """
+    seen = [vehicle for vehicle in estimate.vehicles if vehicle.age_ns == 0]
+    open_to_view = [body for body in bodies if body.visible >= LEAST_VISIBLE and body.T_ego_body.x_m > 0.0]
+    if not seen or not open_to_view:
+        return []
+    at = [estimate.T_world_ego.between(vehicle.T_world_vehicle) for vehicle in seen]
+    goal = [body.T_ego_body for body in open_to_view]
+    bearing, range_m = (np.array([of(p.y_m, p.x_m) for p in at]) for of in (math.atan2, math.hypot))
+    true_bearing, true_range_m = (np.array([of(p.y_m, p.x_m) for p in goal]) for of in (math.atan2, math.hypot))
+    half_rad = np.array([0.5 * body.width_m for body in open_to_view]) / np.maximum(true_range_m, 1.0)
+    aside = np.abs(true_bearing[:, None] - bearing) / half_rad[:, None]
+    along = np.abs(np.log(np.maximum(range_m, 1.0) / np.maximum(true_range_m, 1.0)[:, None])) / MOST_LOG_RANGE
+    off = np.maximum(aside, along)
+    rows, columns = least_cost(np.minimum(off, 1.0))
+    return [(open_to_view[i], seen[j]) for i, j in zip(rows, columns, strict=True) if off[i, j] < 1.0]

@@ -43,6 +43,8 @@ def _emit(B, kind, P, ranges):  # type: ignore[no-untyped-def]
             trucks.truck(B, k, P[k])
         elif what == m.PEDESTRIAN:
             bodies.pedestrian(B, k, P[k])
+            if P[k, m.GLOSS] > 0.5:
+                bodies.pram(B, k, P[k])
         elif what == m.CYCLIST:
             bodies.cyclist(B, k, P[k])
         elif what == m.BUILDING:

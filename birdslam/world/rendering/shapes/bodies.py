@@ -193,8 +193,11 @@ def vehicle(B, body, P):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def person(B, body, P, z_hip, lean, seated):  # type: ignore[no-untyped-def]
-    """Legs, trunk, arms and head of someone HEIGHT tall whose hip is at `z_hip`; clothes are distinguished by face."""
+def person(B, body, P, z_hip, lean, seated, holds):  # type: ignore[no-untyped-def]
+    """Legs, trunk, arms and head of someone HEIGHT tall whose hip is at `z_hip`; clothes are distinguished by face.
+
+    Who `holds` has both hands on a bar ahead.
+    """
     h = P[m.HEIGHT] if not seated else 1.75
     k = h / 1.75
     stride = 0.0 if seated else 0.32 * math.sin(P[m.PHASE])
@@ -223,8 +226,8 @@ def person(B, body, P, z_hip, lean, seated):  # type: ignore[no-untyped-def]
             foot[2] + 0.05,
         )
         shoulder = (lean, s * 0.2 * k, z_hip + 0.52 * k)
-        elbow = (lean + (0.14 if seated else -s * sway * 0.5), s * 0.25 * k, z_hip + 0.26 * k)
-        hand = (lean + 0.36 if seated else -s * sway, s * 0.24 * k, z_hip + (0.2 if seated else 0.0) * k)
+        elbow = (lean + (0.14 if holds else -s * sway * 0.5), s * 0.25 * k, z_hip + 0.26 * k)
+        hand = (lean + 0.36 if holds else -s * sway, s * 0.24 * k, z_hip + (0.2 if holds else 0.0) * k)
         limb(B, body, m.SKIN, shoulder, elbow, 0.055 * k, 0.045 * k, 5)
         limb(B, body, m.SKIN, elbow, hand, 0.045 * k, 0.035 * k, 5)
     ball(B, body, m.SKIN, 0.5 * lean, 0.0, z_hip + 0.3 * k, 0.13 * k, 0.2 * k, 0.36 * k)
@@ -236,7 +239,22 @@ def person(B, body, P, z_hip, lean, seated):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def pedestrian(B, body, P):  # type: ignore[no-untyped-def]
-    person(B, body, P, 0.5 * P[m.HEIGHT], 0.03, False)
+    """Someone on foot, with both hands on a bar where GLOSS is over 0.5."""
+    person(B, body, P, 0.5 * P[m.HEIGHT], 0.03, False, P[m.GLOSS] > 0.5)
+
+
+@njit(cache=True, nogil=True)
+def pram(B, body, P):  # type: ignore[no-untyped-def]
+    """What a pedestrian P pushes: a tub with a hood on four wheels."""
+    x_bar, z_bar = 0.39, 0.61 * P[m.HEIGHT]
+    for s in (-1.0, 1.0):
+        wheel(B, body, m.WHEEL, x_bar + 0.25, 0.22 * s, s, 0.14, 0.05)
+        wheel(B, body, m.WHEEL, x_bar + 0.8, 0.22 * s, s, 0.1, 0.05)
+        limb(B, body, m.METAL, (x_bar, 0.2 * s, z_bar), (x_bar + 0.8, 0.2 * s, 0.1), 0.015, 0.015, 4)
+        limb(B, body, m.METAL, (x_bar + 0.25, 0.2 * s, 0.14), (x_bar + 0.6, 0.2 * s, 0.55), 0.015, 0.015, 4)
+    limb(B, body, m.DARK, (x_bar, -0.24, z_bar), (x_bar, 0.24, z_bar), 0.02, 0.02, 5)
+    ball(B, body, m.PLAIN, x_bar + 0.5, 0.0, 0.62, 0.4, 0.21, 0.17)
+    ball(B, body, m.DARK, x_bar + 0.68, 0.0, 0.75, 0.22, 0.22, 0.25)
 
 
 @njit(cache=True, nogil=True)
@@ -258,7 +276,7 @@ def cyclist(B, body, P):  # type: ignore[no-untyped-def]
         ball(B, body, m.PLAIN, -0.3, 0.0, 0.62, 0.5, 0.17, 0.24)
         ball(B, body, m.PLAIN, 0.42, 0.0, 0.7, 0.25, 0.2, 0.36)
         limb(B, body, m.METAL, (0.62, 0.0, 0.3), (0.4, 0.0, 1.05), 0.05, 0.05, 5)
-        person(B, body, P, 0.86, 0.12, True)
+        person(B, body, P, 0.86, 0.12, True, True)
         return
     for x in (-0.52, 0.52):
         _ring(B, body, x, 0.34, 0.022)
@@ -270,4 +288,4 @@ def cyclist(B, body, P):  # type: ignore[no-untyped-def]
     limb(B, body, m.PLAIN, hub, pedals, 0.02, 0.02, 4)
     limb(B, body, m.METAL, (0.52, 0.0, 0.34), bar, 0.022, 0.022, 4)
     limb(B, body, m.DARK, (0.34, -0.27, 1.0), (0.34, 0.27, 1.0), 0.018, 0.018, 4)
-    person(B, body, P, 0.95, 0.2, True)
+    person(B, body, P, 0.95, 0.2, True, True)
