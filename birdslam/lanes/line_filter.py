@@ -170,7 +170,10 @@ class LineFilter:
         return seen, float(state[-1])
 
     def _owners(self, x: Floats, y: Floats, points: LinePoints, curves: Floats, of: Ids, classes: Ids) -> Ints:
-        """(N,) the line that each point is on, -1: none."""
+        """(N,) the line that each point is on, -1: none. Of two ridges of a row one alone is the line.
+
+        It is the one that a network's mask has, and of such the nearest: kerbstones, joints and rails run beside paint.
+        """
         at = basis(x)
         gap = np.abs(y[:, None] - at @ curves.T)
         blocks = np.stack([self.block(k) for k in range(len(curves))])
@@ -178,7 +181,14 @@ class LineFilter:
         gate = np.clip(GATE_SIGMAS * np.hypot(spread, points.sigma_m[:, None]), LEAST_GATE_M, WIDEST_GATE_M)
         gap = np.where((gap < gate) & (of[:, None] == classes[None]), gap, np.inf)
         nearest = np.argmin(gap, axis=1)
-        return np.where(np.isfinite(gap[np.arange(len(x)), nearest]), nearest, -1)
+        off = gap[np.arange(len(x)), nearest]
+        order = np.lexsort((off, ~points.masked, points.x_m, nearest))
+        order = order[np.isfinite(off[order])]
+        of_line, row = nearest[order], points.x_m[order]
+        first = np.append(True, (np.diff(of_line) != 0) | (np.diff(row) != 0.0))[: len(order)]
+        out = np.full(len(x), -1)
+        out[order[first]] = of_line[first]
+        return out
 
 
 def _bins(

@@ -1,7 +1,8 @@
-"""Which keyframes look like a frame: a bag of binary words (Galvez-Lopez and Tardos 2012) with an inverted index.
+"""Which keyframes look like a frame: each of its corners votes for the keyframe with the descriptor nearest to it.
 
-The words are learned from the map's own descriptors by k-majority and kept in its file, so that nothing has to ship,
-and a map of one town has the words of that town. A look-up is one product of a sparse matrix and a vector.
+The nearest is looked for by an inverted file (Sivic and Zisserman 2003) of faiss: descriptors lie in the lists of their
+nearest words, and those in a few lists are compared bit by bit (Hamming embedding, Jegou et al. 2008). The words are
+learned from the map's own descriptors by k-majority and kept in its file, so that nothing has to ship.
 """
 
 from __future__ import annotations
@@ -12,24 +13,30 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.geometry.arrays import Bools, Floats, Floats32, Ints
-from birdslam.loops.features import DESCRIPTOR_BYTES, hamming
+from birdslam.geometry.arrays import Bools, Floats32
+from birdslam.loops.features import DESCRIPTOR_BYTES
+from birdslam.loops.verification import MATCH_BITS
 
-MOST_WORDS, LEAST_WORDS = 1024, 16
-DESCRIPTORS_PER_WORD = 8
+# How many words: in a list lie as many descriptors as there are lists, within a factor; faiss advises 4 to 16
+WORDS_PER_ROOT, LEAST_WORDS, MOST_WORDS = 4.0, 16, 2048
 LEARNED_FROM = 20_000  # descriptors at the most
 ROUNDS = 5
 AT_A_TIME = 1024  # descriptors, so that a map process does not grow by it
-STALE_REL = 1 / 32  # of the keyframes may be missing in the matrix: a drive's own last ones are none of its loops
+PROBES = 8  # lists that are looked into
 _SEED = 39
+
+
+def words_for(descriptors: int) -> int:
+    """How many words an index of so many descriptors has."""
+    return int(np.clip(WORDS_PER_ROOT * descriptors**0.5, min(LEAST_WORDS, descriptors), MOST_WORDS))
 
 
 def learn_words(descriptors: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """(K, 32) words of descriptors (N, 32), by k-majority from a seeded start: the same each time."""
     random = np.random.default_rng(_SEED)
+    count = words_for(len(descriptors))
     if len(descriptors) > LEARNED_FROM:
         descriptors = descriptors[np.sort(random.choice(len(descriptors), LEARNED_FROM, replace=False))]
-    count = int(np.clip(len(descriptors) // DESCRIPTORS_PER_WORD, min(LEAST_WORDS, len(descriptors)), MOST_WORDS))
     if not count:
         return np.zeros((0, DESCRIPTOR_BYTES), np.uint8)
     words = _signs(descriptors[random.choice(len(descriptors), count, replace=False)])
@@ -50,66 +57,65 @@ def _signs(descriptors: NDArray[np.uint8]) -> Floats32:
     return np.unpackbits(descriptors, axis=1).astype(np.float32) * 2.0 - 1.0
 
 
-def words_of(descriptors: NDArray[np.uint8], words: NDArray[np.uint8]) -> Ints:
-    """(N,) the nearest word of each descriptor."""
-    if not len(words) or not len(descriptors):
-        return np.zeros(0, np.int64)
-    if len(descriptors) < 64:
-        out: Ints = hamming(descriptors, words).argmin(axis=1)
-        return out
-    signs = _signs(words).T
-    begins = range(0, len(descriptors), AT_A_TIME)
-    parts = [(_signs(descriptors[i : i + AT_A_TIME]) @ signs).argmax(axis=1) for i in begins]
-    return np.concatenate(parts).astype(np.int64)
-
-
 class PlaceIndex:
     """Of keyframes, each given by its descriptors; grows by `add`."""
 
     def __init__(self, words: NDArray[np.uint8]) -> None:
         self.words = words
-        self._counts: list[tuple[Ints, Floats]] = []
-        self._matrix: Any = None
-        self._built = 0  # keyframes in the matrix
-        self._idf: Floats = np.zeros(len(words))
+        self._lists: Any = None  # faiss's, of words: its file of descriptors does not keep them alive itself
+        self._file: Any = None
+        self._filed = 0  # keyframes in it
+        self._waiting: list[NDArray[np.uint8]] = []  # those after them
 
     def __len__(self) -> int:
-        return len(self._counts)
+        return self._filed + len(self._waiting)
 
     def add(self, descriptors: NDArray[np.uint8]) -> None:
         """The next keyframe."""
-        present, count = np.unique(words_of(descriptors, self.words), return_counts=True)
-        self._counts.append((present, np.sqrt(count)))
+        self._waiting.append(descriptors)
 
     def look_up(self, descriptors: NDArray[np.uint8], most: int, among: Bools | None = None) -> list[int]:
-        """The numbers of the `most` keyframes most like these descriptors, the best first; `among` (N,): only those."""
-        if not self._counts or not len(descriptors) or not len(self.words):
+        """The numbers of the `most` keyframes most like these descriptors, the best first.
+
+        `among` (N,): only those. The last ones, which a drive has just made, are filed once they are among them: else
+        each corner would vote for the keyframe before it.
+        """
+        if not len(descriptors) or not len(self.words):
             return []
-        if len(self._counts) - self._built > STALE_REL * self._built:
-            self._build()
-        present, count = np.unique(words_of(descriptors, self.words), return_counts=True)
-        query = np.zeros(len(self.words), np.float32)
-        query[present] = np.sqrt(count) * self._idf[present]
-        scores = self._matrix @ query
-        if among is not None:
-            scores = np.where(among[: len(scores)], scores, -1.0)
-        most = min(most, len(scores))
-        best = np.argpartition(-scores, most - 1)[:most]
-        order = best[np.lexsort((best, -scores[best]))]
-        return [int(number) for number in order if scores[number] > 0.0]
+        excluded = np.zeros(0, np.int64) if among is None else np.flatnonzero(~among)
+        self._put_in_file(len(self) if not len(excluded) else int(excluded[0]))
+        if not self._filed:
+            return []
+        bits, rows = self._file.search(np.ascontiguousarray(descriptors), 1)
+        votes = np.bincount(rows[(bits <= MATCH_BITS) & (rows >= 0)], minlength=self._filed)
+        votes[excluded[excluded < self._filed]] = 0
+        order = np.argsort(-votes, kind="stable")[:most]
+        return [int(row) for row in order if votes[row]]
 
-    def _build(self) -> None:
-        from scipy.sparse import csr_matrix  # here: only who looks places up needs it
+    def _put_in_file(self, until: int) -> None:
+        """The keyframes that wait, before this one."""
+        new = self._waiting[: max(until - self._filed, 0)]
+        if not new:
+            return
+        if self._file is None:
+            self._lists, self._file = _empty_file(self.words)
+        rows = np.repeat(np.arange(self._filed, self._filed + len(new)), [len(each) for each in new])
+        self._file.add_with_ids(np.concatenate(new), rows)
+        self._filed += len(new)
+        del self._waiting[: len(new)]
 
-        used = np.bincount(np.concatenate([present for present, _ in self._counts]), minlength=len(self.words))
-        self._idf = np.log((1.0 + len(self._counts)) / (1.0 + used)) + 0.1
-        rows = [weight * self._idf[present] for present, weight in self._counts]
-        rows = [row / max(float(np.linalg.norm(row)), 1e-9) for row in rows]
-        begin = np.concatenate([[0], np.cumsum([len(row) for row in rows])])
-        columns = np.concatenate([present for present, _ in self._counts])
-        data = np.concatenate(rows).astype(np.float32)
-        self._built = len(rows)
-        self._matrix = csr_matrix((data, columns, begin), shape=(len(rows), len(self.words)))
+
+def _empty_file(words: NDArray[np.uint8]) -> tuple[Any, Any]:
+    import faiss  # here: only who looks places up needs it
+
+    faiss.omp_set_num_threads(1)  # the other cores are the frames'
+    bits = 8 * DESCRIPTOR_BYTES
+    lists = faiss.IndexBinaryFlat(bits)
+    lists.add(np.ascontiguousarray(words))
+    file = faiss.IndexBinaryIVF(lists, bits, len(words))
+    file.train(np.ascontiguousarray(words))  # it is: by its words
+    file.nprobe = PROBES
+    return lists, file
 
 
 def index_of(descriptors: Sequence[NDArray[np.uint8]], words: NDArray[np.uint8]) -> PlaceIndex:

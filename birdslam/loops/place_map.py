@@ -20,7 +20,7 @@ from birdslam.loops.gnss.earth import Earth
 from birdslam.loops.gnss.factors import OnEarth
 from birdslam.loops.keyframe import Fixed, Keyframe, LinePiece, Link
 from birdslam.loops.map_pose import EarthPose
-from birdslam.loops.place_index import LEARNED_FROM, PlaceIndex, index_of, learn_words
+from birdslam.loops.place_index import PlaceIndex, index_of, learn_words, words_for
 from birdslam.loops.verification import LocalMap
 from birdslam.types import LineColour, LineKind
 
@@ -90,7 +90,7 @@ class PlaceMap:
         self.drives = drives  # that it was made of
         self.earth = earth  # where it is on Earth; None: no fixes yet
         self.words = words
-        self._learned_from = len(self.keyframes)  # keyframes whose words are known
+        self._descriptors = sum(len(keyframe.descriptors) for keyframe in self.keyframes)
         self._index: PlaceIndex | None = None
         self._poses = np.zeros((0, 3))
 
@@ -107,10 +107,10 @@ class PlaceMap:
         return float(sum(math.hypot(link.T_from_to.x_m, link.T_from_to.y_m) for link in self.links if not link.loop))
 
     def add(self, keyframe: Keyframe) -> None:
-        """A further keyframe; it can be found soon. A young map's words are learned anew each time that it doubles."""
+        """A further keyframe; it can be found soon. Words are learned anew whenever the map wants twice as many."""
         self.keyframes.append(keyframe)
-        young = self._learned_from * len(keyframe.descriptors) < LEARNED_FROM
-        if young and len(self.keyframes) >= 2 * self._learned_from:
+        self._descriptors += len(keyframe.descriptors)
+        if self.words is not None and words_for(self._descriptors) >= 2 * len(self.words):
             self.words, self._index = None, None
         elif self._index is not None:
             self._index.add(keyframe.descriptors)
@@ -148,7 +148,6 @@ class PlaceMap:
             if self.words is None or not len(self.words):
                 every = [keyframe.descriptors for keyframe in self.keyframes]
                 self.words = learn_words(np.concatenate(every) if every else np.zeros((0, 32), np.uint8))
-                self._learned_from = len(self.keyframes)
             self._index = index_of([keyframe.descriptors for keyframe in self.keyframes], self.words)
         return self._index
 

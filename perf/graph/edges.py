@@ -63,6 +63,7 @@ CLIPS = {  # folder, and how many frames are left out at its beginning
 }
 SIMULATED = ("0002", "0003", "0005", "0018")  # sequences whose true poses and boxes simulated drives take
 EGO_DIMENSIONS, PLACE = 3, 2
+SURELY, VEHICLE_IDS = 0.95, 1 << 36  # a vehicle stands; its number among landmarks
 Change = Callable[[Measurements], Measurements]
 
 
@@ -108,6 +109,7 @@ def variants() -> dict[str, Variant]:
                 weights=msgspec.structs.replace(base.weights, leave_out=("lanes",)),
             )
         ),
+        "standing vehicles as landmarks": Variant(base, _with_standing),
         "landmarks share no error": Variant(base, _sharing_nothing),
         "without gates": graph(**gates),
         "gates alone": replace(graph(**bare), change=_sharing_nothing),
@@ -120,6 +122,22 @@ def variants() -> dict[str, Variant]:
 
 def _without_points(m: Measurements) -> Measurements:
     return msgspec.structs.replace(m, cp=tuple(e for e in m.cp if e.kind is LandmarkKind.LANE_STATION))
+
+
+def _with_standing(m: Measurements) -> Measurements:
+    """Vehicles that surely stand as landmarks beside those of the road, where their CV edges see them."""
+    seen = [
+        LandmarkEdge(
+            landmark=VEHICLE_IDS + e.vehicle,
+            frame=e.frame,
+            x_m=e.T_ego_vehicle.x_m,
+            y_m=e.T_ego_vehicle.y_m,
+            cov=(e.cov[0], e.cov[1], e.cov[3], e.cov[4]),
+        )
+        for e in m.cv
+        if e.standing > SURELY
+    ]
+    return msgspec.structs.replace(m, cp=(*m.cp, *seen))
 
 
 def _sharing_nothing(m: Measurements) -> Measurements:

@@ -1,15 +1,15 @@
-"""Candidates for a place by other indices than the map's own: recall among the first six, milliseconds.
+"""Candidates for a place by the map's own index and by all descriptors: recall among the first six, milliseconds.
 
-Ours is a bag of binary words. Faiss looks each descriptor's nearest neighbour up, exactly or by one of its own indices,
-and a keyframe gets a vote for each that is near enough. Without faiss (`pip install faiss-cpu`) ours stands alone.
+Either looks each descriptor's nearest neighbour up, and a keyframe gets a vote for each that is near enough: ours in an
+inverted file of faiss, the other one among all of them.
 """
 
 from __future__ import annotations
 
-import importlib.util
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 
+import faiss
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,40 +21,23 @@ from birdslam.perf.reporting.figures import Ledger
 
 Bytes = NDArray[np.uint8]
 LookUp = Callable[[Bytes], Sequence[int]]
-LISTS_PER_ROOT, PROBES = 4, 8  # of the inverted file: faiss advises 4 to 16 roots of the number
 
 
 def _indices(ours: PlaceIndex, descriptors: Sequence[Bytes]) -> Iterator[tuple[str, LookUp]]:
     """Name and look-up of each."""
-    yield "words", lambda seen: ours.look_up(seen, CANDIDATES)
-    if importlib.util.find_spec("faiss") is None:
-        return
-    import faiss
-
-    faiss.omp_set_num_threads(1)
+    yield "the inverted file", lambda seen: ours.look_up(seen, CANDIDATES)
     every = np.ascontiguousarray(np.concatenate(descriptors))
     owner = np.repeat(np.arange(len(descriptors)), [len(each) for each in descriptors])
-    bits = 8 * every.shape[1]
-    for name in ("faiss, exact", "faiss, inverted file"):
-        if name == "faiss, exact":
-            index = faiss.IndexBinaryFlat(bits)
-        else:
-            lists = max(1, round(LISTS_PER_ROOT * len(every) ** 0.5))
-            index = faiss.IndexBinaryIVF(faiss.IndexBinaryFlat(bits), bits, lists)
-            index.train(every[:: max(1, len(every) // (40 * lists))])
-            index.nprobe = PROBES
-        index.add(every)
-        yield name, _voting(index.search, owner, len(descriptors))
+    index = faiss.IndexBinaryFlat(8 * every.shape[1])
+    index.add(every)
 
-
-def _voting(search: Callable[[Bytes, int], tuple[Bytes, Bytes]], owner: NDArray[np.int64], count: int) -> LookUp:
     def look_up(seen: Bytes) -> Sequence[int]:
-        bits, rows = search(np.ascontiguousarray(seen), 1)
-        votes = np.bincount(owner[rows[bits <= MATCH_BITS]], minlength=count)
+        bits, rows = index.search(np.ascontiguousarray(seen), 1)
+        votes = np.bincount(owner[rows[bits <= MATCH_BITS]], minlength=len(descriptors))
         best = np.argsort(-votes, kind="stable")[:CANDIDATES]
         return [int(row) for row in best if votes[row]]
 
-    return look_up
+    yield "all descriptors", look_up
 
 
 def compare(
