@@ -113,7 +113,10 @@ def boxes(
         if height < LEAST_PX:
             continue
         box += noise * rng.normal(0.0, math.hypot(BOX_SIGMA_REL * height, BOX_SIGMA_PX), 4)
-        found.append(np.clip(box, 0.0, [frame.camera.width_px, frame.camera.height_px] * 2))
+        box = np.clip(box, 0.0, [frame.camera.width_px, frame.camera.height_px] * 2)
+        if (box[2:] - box[:2] < 1.0).any():
+            continue  # a sliver at the image's border
+        found.append(box)
         labels.append("person" if body.label == "pedestrian" else body.label)
         scores.append(0.5 + 0.45 * body.visible)
         bodies.append(body.object_id)
