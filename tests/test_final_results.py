@@ -114,7 +114,7 @@ def test_a_new_epoch_goes_on_in_the_same_file(tmp_path: Path) -> None:
     assert len({e.epoch for e in estimates.values()}) == 2
     assert tracks(tmp_path / "out" / "tracks") == smoothed((m, estimates[m.frame_id]) for m in frames)
     texts = [path.read_text() for path in (tmp_path / "out" / "tracks").glob("*.final.tum.txt")]
-    assert all(text.count("# vehicle") == 1 for text in texts)
+    assert all(text.count("# track") == 1 for text in texts)
     assert any("# epoch 1: a new world frame begins" in text for text in texts)
 
 

@@ -176,7 +176,7 @@ def test_road_and_tracks_lie_beside_the_way_on_earth(tmp_path: Path) -> None:
     (tmp_path / "tracks").mkdir()
     ahead = [(place.t_source_ns / 1e9, *(place.T_odom_ego @ np.array([[10.0, 0.0]]))[0]) for place in places]
     rows = (f"{t:.6f} {x:.4f} {y:.4f} 0 0 0 0 1\n" for t, x, y in ahead)
-    (tmp_path / "tracks" / "3.tum.txt").write_text("# vehicle 3\n" + "".join(rows))
+    (tmp_path / "tracks" / "3.tum.txt").write_text("# track 3\n" + "".join(rows))
     assert set(write_around(tmp_path)) == {"road.map.geojson", "road.geojson", "tracks.geojson"}
     open_m = np.hypot(nodes[-1].T_map_keyframe.x_m - true[-1].x_m, nodes[-1].T_map_keyframe.y_m - true[-1].y_m)
     assert open_m > 10.0

@@ -242,7 +242,7 @@ class Recorder:
         known, lines = self._tracks.pop(vehicle.vehicle, None), []
         if known is None and not path.exists():
             self._track_count += 1
-            lines.append(f"# vehicle {vehicle.vehicle}: t_s x_m y_m z_m qx qy qz qw of its footprint's centre in world")
+            lines.append(f"# track {vehicle.vehicle}: t_s x_m y_m z_m qx qy qz qw of its footprint's centre in world")
             lines.append("# z is the height of the road under the ego: a vehicle's own is not estimated")
         if known is not None and known[1] != estimate.epoch:
             lines.append(f"# epoch {estimate.epoch}: a new world frame begins")

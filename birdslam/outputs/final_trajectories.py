@@ -95,7 +95,7 @@ class FinalTracks:
             file.write(f"# epoch {track.epoch}: a new world frame begins\n")
         else:
             file.write(
-                f"# vehicle {vehicle}, smoothed: t_s x_m y_m z_m qx qy qz qw of its footprint's centre in world\n"
+                f"# track {vehicle}, smoothed: t_s x_m y_m z_m qx qy qz qw of its footprint's centre in world\n"
             )
             file.write("# z is the height of the road under the ego: a vehicle's own is not estimated\n")
         if track.last is not None:
