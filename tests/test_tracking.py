@@ -98,6 +98,17 @@ def test_a_gap_shorter_than_forget_s_keeps_the_id() -> None:
     assert ids == {0}
 
 
+def test_after_a_gap_a_car_that_stands_takes_no_box_of_the_one_beside_it() -> None:
+    drive, near, tracks = Drive(noise_px=0.3), SE2(60.0, -4.0, 0.0), list[Track]()
+    for k in range(22):
+        tracks = drive.step(SE2(0.6 * k, 0.0, 0.0), [near])
+    assert tracks[0].stands
+    for k in range(22, 24):
+        drive.step(SE2(0.6 * k, 0.0, 0.0), [])
+    ids = {t.vehicle for k in range(24, 27) for t in drive.step(SE2(0.6 * k, 0.0, 0.0), [SE2(61.5, -5.5, 0.0)])}
+    assert ids == {1}  # its box overlaps by a fifth, and the car is expected to within a fifth of its width
+
+
 def test_a_gap_longer_than_forget_s_gives_a_new_id() -> None:
     drive = Drive()
     ids = set()

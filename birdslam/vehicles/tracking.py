@@ -19,7 +19,14 @@ from birdslam.perception import DepthMap, Detections
 from birdslam.types import MotionEdge
 from birdslam.vehicles.association import at_border, by_track_id, predicted_boxes_px, with_track_ids, within_gate
 from birdslam.vehicles.placement.depth_fusion import DepthPlace, PseudoLidarConfig
-from birdslam.vehicles.placement.localisation import LocalisationConfig, Observation, Place, iou, observe_boxes
+from birdslam.vehicles.placement.localisation import (
+    NEAREST_M,
+    LocalisationConfig,
+    Observation,
+    Place,
+    iou,
+    observe_boxes,
+)
 from birdslam.vehicles.placement.pseudolidar import FrustumNetwork, locate_by_depth
 from birdslam.vehicles.placing import Assignment, Placing
 from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
@@ -27,6 +34,8 @@ from birdslam.vehicles.state.yaw_filter import YawFilter
 from birdslam.vehicles.track import EgoFrame, Track, TrackingConfig, VehicleFilter, in_vehicle_axes
 
 Floats = NDArray[np.float64]
+
+UNSURE_SIGMA = 2.0  # a vehicle may have moved so far from where it is expected
 
 
 class Tracker:
@@ -171,12 +180,25 @@ class Tracker:
         return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if possible[i, j]]
 
     def _least_overlap(self, predicted_px: Floats) -> Floats:
-        """(N,) of each track's box with the one predicted (N, 4), for it to be the same vehicle's."""
+        """(N,) of each track's box with the one predicted (N, 4), for it to be the same vehicle's.
+
+        Of one just seen it is that of the next box. Later it falls with the overlap that is left of two boxes that are
+        UNSURE_SIGMA of the motion since then apart.
+        """
         assert self._last is not None
-        t_ns = self._last.t_source_ns
+        t_ns, T_world_ego = self._last.t_source_ns, self._last.T_world_ego
         unseen_s = np.array([(t_ns - track.frame.t_source_ns) * 1e-9 for track in self.tracks])
-        surely = (unseen_s <= self.config.just_seen_s) & ~at_border(predicted_px, self.camera)
-        return np.where(surely, self.config.min_iou_just_seen, self.config.min_iou)
+        R = T_world_ego.rotation()
+        ahead, aside = np.einsum("ji,njk,ki->in", R, np.array([track.cov[2:, 2:] for track in self.tracks]), R)
+        sight = (np.array([track.state[:2] for track in self.tracks]) - [T_world_ego.x_m, T_world_ego.y_m]) @ R
+        depth_m = np.maximum(sight[:, 0], NEAREST_M)
+        nearer = UNSURE_SIGMA * np.sqrt(ahead) * unseen_s / depth_m  # relative
+        shift_px = UNSURE_SIGMA * np.sqrt(aside) * unseen_s / depth_m * self.camera.fx_px
+        shift = np.minimum(shift_px / np.maximum(predicted_px[:, 2] - predicted_px[:, 0], 1.0), 1.0)
+        left = (1.0 - shift) / (1.0 + shift) / np.square(1.0 + nearer)
+        just_seen = np.where(unseen_s <= self.config.just_seen_s, 1.0, left)
+        least = np.maximum(self.config.min_iou, self.config.min_iou_just_seen * just_seen)
+        return np.where(at_border(predicted_px, self.camera), self.config.min_iou, least)
 
     def _correct(self, assignments: Sequence[Assignment], places: Sequence[Place], frame: EgoFrame) -> None:
         """The known tracks among the assignments, all at once, by the places of their observations in this frame."""
