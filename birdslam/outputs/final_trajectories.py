@@ -94,9 +94,7 @@ class FinalTracks:
         if vehicle in self._written:
             file.write(f"# epoch {track.epoch}: a new world frame begins\n")
         else:
-            file.write(
-                f"# track {vehicle}, smoothed: t_s x_m y_m z_m qx qy qz qw of its footprint's centre in world\n"
-            )
+            file.write(f"# track {vehicle}, smoothed: t_s x_m y_m z_m qx qy qz qw of its footprint's centre in world\n")
             file.write("# z is the height of the road under the ego: a vehicle's own is not estimated\n")
         if track.last is not None:
             edge = track.last
