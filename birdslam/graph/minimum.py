@@ -40,15 +40,19 @@ def minimise(window: Window, of_vehicles: Sequence[Linearised], terms: Sequence[
             _all_at_once(window, of_vehicles, window.layout.ego_poses)
             _all_at_once(window, terms, EGO if hold_ego else None)
             return
+        moved = np.zeros((len(window.velocity), OF_VEHICLE))
         for term in of_vehicles:
-            _each_vehicle(window, term)
+            _each_vehicle(window, term, moved)
         _egos(window, terms, EGO if hold_ego else None)
     except np.linalg.LinAlgError:  # no numbers of a road: something here is no covariance any more
         window.of_egos[:] = np.nan
 
 
-def _each_vehicle(window: Window, term: Linearised) -> None:
-    """Edges that are each of one vehicle, which nothing ties to another: k systems of d equations, not one of k d."""
+def _each_vehicle(window: Window, term: Linearised, moved: Floats) -> None:
+    """Edges that are each of one vehicle, which nothing ties to another: k systems of d equations, not one of k d.
+
+    `moved` (M, 6) is by how much the terms before have moved each vehicle since its edges were linearised.
+    """
     if term.vehicles is None:
         raise ValueError("edges that leave the ego where it is are of single vehicles: `Linearised.vehicles`")
     rows: list[int] | slice = term.vehicles
@@ -59,8 +63,10 @@ def _each_vehicle(window: Window, term: Linearised) -> None:
     if isinstance(J, list):
         HV, HC = V.take(J, axis=1), C.take(J, axis=1)
         S = HV.take(J, axis=2)
+        residual = residual - moved[rows].take(J, axis=1)[:, :, None]
     else:
         HV, HC = J @ V, J @ C
+        residual = residual - J @ moved[rows][:, :, None]
         S = HV @ J.transpose(0, 2, 1)
     S += term.covs
     S.reshape(k, d * d)[:, :: d + 1] += _LEAST
@@ -70,7 +76,9 @@ def _each_vehicle(window: Window, term: Linearised) -> None:
     gain = HV.transpose(0, 2, 1) @ weights  # P H' S^-1
     window.of_vehicles[rows] -= gain @ HV
     window.with_egos[rows] -= gain @ HC
-    window.shift_vehicles(rows, (gain @ residual)[:, :, 0])  # Eq. 8: where the sum of window's own cost and F is least
+    dx = (gain @ residual)[:, :, 0]  # Eq. 8: where the sum of the window's own cost and F is least
+    window.shift_vehicles(rows, dx)
+    moved[rows] += dx
 
 
 def _egos(window: Window, terms: Sequence[Linearised], hold: slice | None) -> None:
@@ -192,6 +200,7 @@ def _inflate(blocks: Floats, term: Linearised, gate: float, distances: Floats) -
 
     Whether any is past it.
     """
+    term.outliers = []
     if distances.max() <= gate:
         return False
     outliers = np.flatnonzero(distances > 4.0 * gate).tolist()
