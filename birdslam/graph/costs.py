@@ -22,7 +22,8 @@ def binary_residuals(measured_at: Complexes, measured_heading: Complexes, at: Co
     out = np.empty((len(at), 3))
     gap = measured_at - at  # Eq. 2: its translation
     out[:, 0], out[:, 1] = gap.real, gap.imag
-    out[:, 2] = np.angle(measured_heading * heading.conj())  # Eq. 2: its rotation
+    turn = measured_heading * heading.conj()
+    out[:, 2] = np.arctan2(turn.imag, turn.real)  # Eq. 2: its rotation
     return out
 
 

@@ -62,7 +62,7 @@ def vehicle_estimates(
         moving, moving_covs = reported_velocities(vehicles, moving, moving_covs)
     near = _approaches(window, ego_mps, sizes, at, moving, moving_covs)
     numbers = np.empty((len(vehicles), 18))  # of each record, in a row
-    numbers[:, 0], numbers[:, 1], numbers[:, 2] = at.real, at.imag, np.angle(heading)
+    numbers[:, 0], numbers[:, 1], numbers[:, 2] = at.real, at.imag, np.arctan2(heading.imag, heading.real)
     numbers[:, 3:5], numbers[:, 5:9] = moving, moving_covs.reshape(-1, 4)
     numbers[:, 9:].reshape(-1, 3, 3)[...] = covs[:, :3, :3]
     return tuple(
@@ -148,8 +148,8 @@ def marginals_in_world(
     C[:, :3, :3], C[:, 3:, :3], C[:, 3:, 3:] = window.ego_cov, window.with_egos[:, :, EGO], window.each_vehicle
     C[:, :3, 3:] = C[:, 3:, :3].transpose(0, 2, 1)
     if late:
-        np.einsum("mii->mi", C)[:, 6:] += np.outer(ahead_s, changes)
+        C.reshape(-1, 81)[:, 60::10] += np.outer(ahead_s, changes)
     covs: Floats = J @ C @ J.transpose(0, 2, 1)
-    variances = np.einsum("mii->mi", covs)
+    variances = covs.reshape(-1, 25)[:, ::6]
     np.maximum(variances, 0.0, out=variances)  # where all is known, rounding has either sign
     return at * ego + origin, in_world, velocities, covs

@@ -109,6 +109,12 @@ class Window:
         return np.einsum("isit->ist", self.of_vehicles.reshape(M, OF_VEHICLE, M, OF_VEHICLE))
 
     @property
+    def _variances(self) -> Floats:
+        """(M, 6) of the vehicles' own numbers, a view."""
+        B, n, _ = self.of_vehicles.shape
+        return self.of_vehicles.reshape(B, n * n)[:, :: n + 1].reshape(-1, OF_VEHICLE)
+
+    @property
     def P(self) -> Floats:
         """(n, n) a copy of all as one matrix; without `together` vehicles have nothing in common in it."""
         n = self.layout.ego_poses.stop
@@ -133,7 +139,7 @@ class Window:
     @property
     def is_finite(self) -> bool:
         """False: numbers that no road has, and the window is of no more use."""
-        return math.isfinite(self.of_egos.trace() + np.einsum("bii->", self.of_vehicles))
+        return math.isfinite(self.of_egos.trace() + self._variances.sum())
 
     @property
     def is_keyframe(self) -> bool:
@@ -173,7 +179,7 @@ class Window:
         back = cmath.rect(1.0, -T_ego_next.yaw_rad)
         F = self._move_poses(T_ego_next, back, dt_s)
         if any(twist_growth) and len(dt_s):
-            np.einsum("mii->mi", self.each_vehicle)[:, TWIST] += np.outer(dt_s, twist_growth)
+            self._variances[:, TWIST] += np.outer(dt_s, twist_growth)
         if node == 0:  # now and then, so that rounding can't add up
             self.of_egos = 0.5 * (self.of_egos + self.of_egos.T)
             self.of_vehicles = 0.5 * (self.of_vehicles + self.of_vehicles.transpose(0, 2, 1))
