@@ -54,6 +54,7 @@ PAPER = SlamConfig(
         correlation_length_m=0.0,  # no error but those of the edges
         zero_velocity_update=False,
         vehicles_move_ego=True,  # all edges of Eq. 8 at once
+        lasting_share=0.0,  # each edge is independent of all others
         front_back_ambiguity=False,  # a measured yaw counts as it is
     ),
 )

@@ -18,7 +18,7 @@ from birdslam.geometry.se2 import SE2
 from birdslam.graph.around.approach import approaches
 from birdslam.graph.costs import Triple
 from birdslam.graph.standing import judge, reported_velocities
-from birdslam.graph.state_layout import EGO
+from birdslam.graph.state_layout import EGO, TWIST
 from birdslam.graph.vehicles import VehicleNode
 from birdslam.graph.window import Window
 from birdslam.types import Approach, VehicleEstimate
@@ -145,7 +145,9 @@ def marginals_in_world(
     numbers[20:] = ahead_s * x, ahead_s * y
     J = numbers.T.take(_JACOBIAN, axis=1)
     C = np.empty((len(at), 9, 9))  # of the ego in world and of each vehicle's own numbers
-    C[:, :3, :3], C[:, 3:, :3], C[:, 3:, 3:] = window.ego_cov, window.with_egos[:, :, EGO], window.each_vehicle
+    own = slice(0, TWIST.stop)
+    C[:, :3, :3], C[:, 3:, :3] = window.ego_cov, window.with_egos[:, own, EGO]
+    C[:, 3:, 3:] = window.each_vehicle[:, own, own]
     C[:, :3, 3:] = C[:, 3:, :3].transpose(0, 2, 1)
     if late:
         C.reshape(-1, 81)[:, 60::10] += np.outer(ahead_s, changes)

@@ -11,7 +11,7 @@ import numpy as np
 from birdslam.geometry.arrays import Floats
 from birdslam.graph.costs import inflation, pose_costs
 from birdslam.graph.factors.factor import Linearised
-from birdslam.graph.state_layout import EGO, OF_VEHICLE, StateLayout, diagonal_blocks
+from birdslam.graph.state_layout import EGO, LASTING, OF_VEHICLE, StateLayout, diagonal_blocks
 from birdslam.graph.window import Window
 
 _LEAST = 1e-8  # 0.1 mm, 0.1 mrad: edges more exact than that would cost the covariances their digits
@@ -31,14 +31,14 @@ def minimise(window: Window, of_vehicles: Sequence[Linearised], terms: Sequence[
     """The minimum of Eq. 8 over the edges of the newest frame, all at once, linearised at the prediction.
 
     The edges `of_vehicles` leave the ego's poses where they are; `hold_ego` is of the newest pose alone and of the
-    other `terms`. What is held keeps its mean and covariance, and its part in all others' uncertainty: it is
-    considered, not estimated (Schmidt 1966). Notes in each term which of its edges are outliers. Where the numbers
+    other `terms`; lasting errors of vehicles' edges are held in all. What is held keeps its mean and covariance, and
+    its part in all others' uncertainty: it is considered, not estimated (Schmidt 1966). Notes in each term which of its edges are outliers. Where the numbers
     leave all bounds, the window is not finite afterwards.
     """
     try:
         if window.together:
             _all_at_once(window, of_vehicles, window.layout.ego_poses)
-            _all_at_once(window, terms, EGO if hold_ego else None)
+            _all_at_once(window, terms, EGO if hold_ego else slice(0))
             return
         moved = np.zeros((len(window.velocity), OF_VEHICLE))
         for term in of_vehicles:
@@ -74,7 +74,10 @@ def _each_vehicle(window: Window, term: Linearised, moved: Floats) -> None:
     if term.gate is not None and _inflate(S, term, term.gate, pose_costs(residual, weights)):
         weights = _inverses(S)
     gain = HV.transpose(0, 2, 1) @ weights  # P H' S^-1
-    window.of_vehicles[rows] -= gain @ HV
+    gain[:, LASTING] = 0.0
+    corrected = window.of_vehicles[rows] - gain @ HV
+    corrected[:, LASTING] = corrected[:, :, LASTING].transpose(0, 2, 1)
+    window.of_vehicles[rows] = corrected
     window.with_egos[rows] -= gain @ HC
     dx = (gain @ residual)[:, :, 0]  # Eq. 8: where the sum of the window's own cost and F is least
     window.shift_vehicles(rows, dx)
@@ -114,7 +117,7 @@ def _egos(window: Window, terms: Sequence[Linearised], hold: slice | None) -> No
         window.shift_vehicles(slice(None), (whitened_residual @ of_vehicles).reshape(-1, OF_VEHICLE))
 
 
-def _all_at_once(window: Window, terms: Sequence[Linearised], hold: slice | None) -> None:
+def _all_at_once(window: Window, terms: Sequence[Linearised], hold: slice) -> None:
     """Edges of any part of the state, over P as one matrix."""
     if not terms:
         return
@@ -132,11 +135,11 @@ def _all_at_once(window: Window, terms: Sequence[Linearised], hold: slice | None
         raise np.linalg.LinAlgError
     W = blas.dtrsm(1.0, L, HP.T, side=1, lower=1, trans_a=1, overwrite_b=1).T  # P H' S^-1 H P = W'W
     dx = blas.dtrsv(L, _residual(terms), lower=1, overwrite_x=1) @ W  # Eq. 8, as above
-    held = None if hold is None else P[hold, hold].copy()
+    held = [*range(hold.stop), *window.layout.of_vehicles[:, LASTING].ravel().tolist()]
+    of_held = P[np.ix_(held, held)]
     P -= W.T @ W
-    if hold is not None:
-        dx[hold] = 0.0
-        P[hold, hold] = held
+    dx[held] = 0.0
+    P[np.ix_(held, held)] = of_held
     window.set_P(P)
     window.shift(dx)
 

@@ -28,6 +28,7 @@ from birdslam.graph.factors.factor import Factor, GraphFrame, Linearised
 from birdslam.graph.factors.standard import standard_factors
 from birdslam.graph.factors.vehicle_detection import VehicleDetections
 from birdslam.graph.graph_config import GraphConfig, check_together
+from birdslam.graph.factors.lasting_error import relative_sigmas, sight_factors
 from birdslam.graph.marginals import vehicle_estimates
 from birdslam.graph.minimum import minimise, solver
 from birdslam.graph.pending_map import PendingMap
@@ -226,7 +227,8 @@ class PoseGraph:
         """The frame with its edges to vehicles of the window."""
         associations = self._vehicles.associate(edges, m.frame_id, m.t_source_ns, self.config.constant_velocity)
         zero_velocity = self.config.zero_velocity_update and Status.STANDSTILL in m.status
-        return GraphFrame(m, edges, records, self._vehicles, associations, zero_velocity)
+        passed_s = max((m.t_source_ns - self._t_ns) * 1e-9, 0.0)
+        return GraphFrame(m, edges, records, self._vehicles, associations, zero_velocity, passed_s)
 
     def _predict(self, frame: GraphFrame, window: Window) -> None:
         """The window on to this frame."""
@@ -259,7 +261,9 @@ class PoseGraph:
         if begun:
             begins = [self._vehicles.begin(cv[k].vehicle, m.frame_id, m.t_source_ns) for k in begun]
             seen = cv_edges(begins, frame.edges.cv_numbers[begun])
-            window.place_vehicles(seen, self._birth_covs(seen.covs[:, 2, 2]))
+            factors = sight_factors(seen.at, seen.covs)
+            lasting, sigma_rel = math.sqrt(self.config.lasting_share) * factors, relative_sigmas(seen, factors)
+            window.place_vehicles(seen, self._birth_covs(seen.covs[:, 2, 2]), lasting, sigma_rel)
 
     def _birth_covs(self, yaw_variances: Floats) -> Floats:
         """(k, 3, 3) of the twists of vehicles seen for the first time, at rest for all that is known.

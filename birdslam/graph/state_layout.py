@@ -1,6 +1,6 @@
 """Where the state vector of the window, and so the rows and columns of its covariance P, holds what.
 
-[ego in world (3) | ego nodes (3 each) | vehicles (3 of the pose and 3 of the twist each)]
+[ego in world (3) | ego nodes (3 each) | vehicles (3 of the pose, 3 of the twist, 2 of the lasting error of its edges)]
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ import numpy as np
 from birdslam.geometry.arrays import Floats
 
 EGO = slice(0, 3)
-OF_VEHICLE = 6  # numbers of a vehicle
-POSE, TWIST = slice(0, 3), slice(3, 6)  # of its own numbers
+OF_VEHICLE = 8  # numbers of a vehicle
+POSE, TWIST, LASTING = slice(0, 3), slice(3, 6), slice(6, 8)  # of its own numbers
 
 
 class StateLayout:
@@ -24,15 +24,15 @@ class StateLayout:
         self.size = first + OF_VEHICLE * vehicles
         self.ego_poses = slice(0, first)  # the newest and the nodes
         of_vehicles = first + np.arange(OF_VEHICLE * vehicles, dtype=np.int64).reshape(vehicles, OF_VEHICLE)
-        self.of_vehicles = of_vehicles  # (M, 6)
+        self.of_vehicles = of_vehicles  # (M, 8)
         self.poses, self.twists = of_vehicles[:, POSE], of_vehicles[:, TWIST]  # (M, 3) each
         # How poses that are relative to the newest ego move when it does, but for the lever of its turn: (first, 3) of
-        # the ego poses, its own first, and (M, 6, 3) of the vehicles
+        # the ego poses, its own first, and (M, 8, 3) of the vehicles
         self.egos_against = -np.tile(np.eye(3), (1 + nodes, 1))
         self.egos_against[EGO] = np.eye(3)
         self.vehicles_against = np.zeros((vehicles, OF_VEHICLE, 3))
         self.vehicles_against[:, POSE] = -np.eye(3)
-        self.vehicles_stay = np.tile(np.eye(OF_VEHICLE), (vehicles, 1, 1))  # (M, 6, 6) of those that do not drive
+        self.vehicles_stay = np.tile(np.eye(OF_VEHICLE), (vehicles, 1, 1))  # (M, 8, 8) of those that do not drive
         # When the newest ego pose moves: where each entry of the Jacobian of the ego poses, its own adjoint and the
         # nodes' turn, stands in (0, 1, cos, sin, -sin, and the lever of the turn, y and -x)
         self.ego_moves = np.zeros((first, first), dtype=np.int64)

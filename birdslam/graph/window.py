@@ -25,11 +25,12 @@ from birdslam.geometry.arrays import Complexes, Floats
 from birdslam.geometry.constant_twist import advance
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.edges import CvEdges
-from birdslam.graph.state_layout import EGO, OF_VEHICLE, POSE, TWIST, StateLayout
+from birdslam.graph.state_layout import EGO, LASTING, OF_VEHICLE, POSE, TWIST, StateLayout
 
 KEY_NODE = 0  # the ego node that landmarks are tied to; it is renewed once in every round of the nodes
 KEY_PLACE = [3 * KEY_NODE + 3, 3 * KEY_NODE + 4]  # the rows of its place
 EGO_PLACE = [0, 1]
+PLACE = slice(POSE.start, POSE.start + 2)  # of a vehicle's own numbers
 
 
 class WindowState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -43,6 +44,7 @@ class WindowState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     heading: Complexes
     velocity: Complexes
     turn_radps: Floats
+    sigma_rel: Floats
     of_egos: Floats
     with_egos: Floats
     of_vehicles: Floats
@@ -65,11 +67,13 @@ class Window:
         self.heading = np.ones(nodes, np.complex128)
         self.velocity = np.zeros(0, np.complex128)  # in the vehicle's own frame, m/s
         self.turn_radps = np.zeros(0)
+        # (M, 2) 1-sigma of each vehicle's last CV edge along and across the line of sight, fractions of its distance
+        self.sigma_rel = np.zeros((0, 2))
         self.layout = StateLayout.of(nodes, 0)
         self.together = together
         self.of_egos = np.zeros((self.layout.size, self.layout.size))  # (E, E)
-        self.with_egos = np.zeros((0, OF_VEHICLE, self.layout.size))  # (M, 6, E)
-        # (B, 6k, 6k): one block of k = M vehicles together, or B = M blocks of one
+        self.with_egos = np.zeros((0, OF_VEHICLE, self.layout.size))  # (M, 8, E)
+        # (B, 8k, 8k): one block of k = M vehicles together, or B = M blocks of one
         self.of_vehicles = np.zeros((1, 0, 0) if together else (0, OF_VEHICLE, OF_VEHICLE))
 
     def state(self) -> WindowState:
@@ -82,10 +86,10 @@ class Window:
         nodes, M = len(state.node_frames), len(state.velocity)
         layout, window = StateLayout.of(nodes, M), Window(nodes, state.frame, together)
         E, n = layout.ego_poses.stop, OF_VEHICLE * M
-        sizes = len(state.at), len(state.heading), len(state.turn_radps)
+        sizes = len(state.at), len(state.heading), len(state.turn_radps), len(state.sigma_rel)
         shapes = state.of_egos.shape, state.with_egos.shape, state.of_vehicles.shape
         blocks = (1, n, n) if together else (M, OF_VEHICLE, OF_VEHICLE)
-        fit = sizes == (nodes + M, nodes + M, M) and shapes == ((E, E), (M, OF_VEHICLE, E), blocks)
+        fit = sizes == (nodes + M, nodes + M, M, M) and shapes == ((E, E), (M, OF_VEHICLE, E), blocks)
         if not fit or not 0 <= state.next_node < nodes:
             raise ValueError(f"a window of {nodes} nodes and {M} vehicles with arrays of {sizes}, {shapes}")
         for name in WindowState.__struct_fields__:
@@ -102,7 +106,7 @@ class Window:
 
     @property
     def each_vehicle(self) -> Floats:
-        """(M, 6, 6) of the vehicles' own numbers."""
+        """(M, 8, 8) of the vehicles' own numbers."""
         if not self.together:
             return self.of_vehicles
         M = len(self.velocity)
@@ -110,7 +114,7 @@ class Window:
 
     @property
     def _variances(self) -> Floats:
-        """(M, 6) of the vehicles' own numbers, a view."""
+        """(M, 8) of the vehicles' own numbers, a view."""
         B, n, _ = self.of_vehicles.shape
         return self.of_vehicles.reshape(B, n * n)[:, :: n + 1].reshape(-1, OF_VEHICLE)
 
@@ -202,7 +206,7 @@ class Window:
     def _move_poses(self, T_ego_next: SE2, back: complex, dt_s: Floats) -> Floats:
         """All poses, relative to the next ego pose, whose axes are turned by `back`; vehicles drive on.
 
-        Returns (M, 6, 6) how the errors of a vehicle's pose and twist move.
+        Returns (M, 8, 8) how the errors of a vehicle's pose and twist move.
         """
         self.at = (self.at - complex(T_ego_next.x_m, T_ego_next.y_m)) * back
         self.heading = self.heading * back
@@ -212,11 +216,11 @@ class Window:
         n = self.nodes
         way, self.heading[n:], g, d = advance(self.heading[n:], self.velocity, self.turn_radps, dt_s)
         self.at[n:] += way
-        place = np.empty((len(F), OF_VEHICLE), np.complex128)  # x + iy of the next place by each number
+        place = np.empty((len(F), TWIST.stop), np.complex128)  # x + iy of the next place by pose and twist
         place[:, :2] = back, 1j * back
         place[:, 2], place[:, 3], place[:, 5] = 1j * way, g, d
         place[:, 4] = 1j * g
-        F[:, 0], F[:, 1], F[:, 2, 5] = place.real, place.imag, dt_s
+        F[:, 0, : TWIST.stop], F[:, 1, : TWIST.stop], F[:, 2, 5] = place.real, place.imag, dt_s
         return F
 
     def _move_errors(self, T_ego_next: SE2, back: complex, F: Floats) -> None:
@@ -287,7 +291,7 @@ class Window:
         self.heading[:n] *= np.exp(1j * dx[5::3])
 
     def shift_vehicles(self, rows: Sequence[int] | slice, dx: Floats) -> None:
-        """Moves the means of vehicles `rows` (k,), each once, by `dx` (k, 6)."""
+        """Moves the means of vehicles `rows` (k,), each once, by `dx` (k, 8), of which a lasting error has none."""
         self.at[self.nodes :][rows] += dx[:, 0] + 1j * dx[:, 1]
         self.heading[self.nodes :][rows] *= np.exp(1j * dx[:, 2])
         self.velocity[rows] += dx[:, 3] + 1j * dx[:, 4]
@@ -311,11 +315,27 @@ class Window:
 
     # --- vehicles come and go ---
 
-    def place_vehicles(self, seen: CvEdges, twist_covs: Floats) -> None:
-        """Vehicles begin anew where they are seen, at rest give or take, independent of all else."""
+    def place_vehicles(self, seen: CvEdges, twist_covs: Floats, lasting: Floats, sigma_rel: Floats) -> None:
+        """Vehicles begin anew where they are seen, at rest give or take, independent of all else.
+
+        `lasting` (k, 2, 2) and `sigma_rel` (k, 2) are of their edges; see lasting_error.py.
+        """
         self.at[self.nodes :][seen.rows], self.heading[self.nodes :][seen.rows] = seen.at, seen.heading
         self._renew(seen.rows, POSE, seen.covs)
         self.set_twists(seen.rows, np.zeros(len(seen.rows)), np.zeros(len(seen.rows)), twist_covs)
+        self._renew(seen.rows, LASTING, np.eye(2))
+        self._relate(seen.rows, PLACE, LASTING, -lasting)  # where they are is the edge less its error
+        self.sigma_rel[seen.rows] = sigma_rel
+
+    def fade_lasting(self, rows: Sequence[int], kept: Floats, sigma_rel: Floats) -> None:
+        """The lasting errors of vehicles `rows` (k,) are by `kept` (k, 2) those of their last edges, the rest is new."""
+        factor = np.ones((len(self.velocity), OF_VEHICLE))
+        factor[rows, LASTING] = kept
+        own = factor.reshape(self.of_vehicles.shape[:2])
+        self.with_egos *= factor[:, :, None]
+        self.of_vehicles *= own[:, :, None] * own[:, None]
+        self._variances[:, LASTING] = 1.0
+        self.sigma_rel[rows] = sigma_rel
 
     def set_twists(self, rows: Sequence[int], velocity: Complexes | Floats, turn_radps: Floats, covs: Floats) -> None:
         """Vehicles `rows` (k,) get new twists with `covs` (k, 3, 3), independent of all else; their poses stay."""
@@ -323,14 +343,24 @@ class Window:
         self._renew(rows, TWIST, covs)
 
     def _renew(self, rows: Sequence[int], numbers: slice, covs: Floats) -> None:
-        """These three numbers of each vehicle get their covariance (k, 3, 3), and no correlation with others."""
+        """These n numbers of each vehicle get their covariance (k, n, n), and no correlation with others."""
         self.with_egos[rows, numbers] = 0.0
-        B, size, _ = self.of_vehicles.shape
-        V = self.of_vehicles.reshape(B, size // OF_VEHICLE, OF_VEHICLE, size // OF_VEHICLE, OF_VEHICLE)
-        block, within = (0, rows) if self.together else (rows, 0)
+        V, block, within = self._by_vehicle(rows)
         V[block, within, numbers] = 0.0
         V[block, :, :, within, numbers] = 0.0
         V[block, within, numbers, within, numbers] = covs
+
+    def _relate(self, rows: Sequence[int], numbers: slice, others: slice, covs: Floats) -> None:
+        """Numbers of each vehicle get these covariances (k, n, m) with other numbers of it."""
+        V, block, within = self._by_vehicle(rows)
+        V[block, within, numbers, within, others] = covs
+        V[block, within, others, within, numbers] = covs.transpose(0, 2, 1)
+
+    def _by_vehicle(self, rows: Sequence[int]) -> tuple[Floats, Any, Any]:
+        """A view (B, k, 8, k, 8) of `of_vehicles`, and in which block and where within it vehicles `rows` are."""
+        B, size, _ = self.of_vehicles.shape
+        V = self.of_vehicles.reshape(B, size // OF_VEHICLE, OF_VEHICLE, size // OF_VEHICLE, OF_VEHICLE)
+        return (V, 0, rows) if self.together else (V, rows, 0)
 
     def select(self, rows: Sequence[int]) -> None:
         """Keeps the vehicles `rows` in that order; -1 makes room for a new one, to be placed next."""
@@ -341,6 +371,7 @@ class Window:
         self.heading = np.concatenate([self.heading[:n], _selected(self.heading[n:], kept, old, M, 1.0)])
         self.velocity = _selected(self.velocity, kept, old, M, 0.0)
         self.turn_radps = _selected(self.turn_radps, kept, old, M, 0.0)
+        self.sigma_rel = _selected(self.sigma_rel, kept, old, M, 0.0)
         self.with_egos = _selected(self.with_egos, kept, old, M, 0.0)
         if not self.together:
             self.of_vehicles = _selected(before_V, kept, old, M, 0.0)

@@ -90,7 +90,7 @@ def variants() -> dict[str, Variant]:
     moved = graph(vehicles_move_ego=True)
     with_lanes = Variant(replace(base, weights=msgspec.structs.replace(base.weights, leave_out=("vv",))))
     gates = {"detection_gate_sigma": NO_GATE, "landmark_gate_sigma": NO_GATE}
-    bare = {"correlation_length_m": 0.0, "front_back_ambiguity": False}
+    bare = {"correlation_length_m": 0.0, "front_back_ambiguity": False, "lasting_share": 0.0}
     found = {
         "default": Variant(base),
         "vehicles move the ego": moved,
@@ -111,6 +111,7 @@ def variants() -> dict[str, Variant]:
         ),
         "standing vehicles as landmarks": Variant(base, _with_standing),
         "landmarks share no error": Variant(base, _sharing_nothing),
+        "errors of vehicles' edges do not last": graph(lasting_share=0.0),
         "without gates": graph(**gates),
         "gates alone": replace(graph(**bare), change=_sharing_nothing),
     }

@@ -65,6 +65,7 @@ def idea_variants() -> dict[str, Method]:
         "standstill held": ("zero_velocity_update",),
         "a front that may be a back": ("front_back_ambiguity",),
         "vehicles leave the ego where it is": ("vehicles_move_ego",),
+        "errors of detections that last": ("lasting_share",),
     }
     out: dict[str, Method] = {"nothing (the paper)": PAPER}
     for name, fields in alone.items():
@@ -135,7 +136,8 @@ def _without_cv(base: Live) -> Live:
     """Nor CP edges of vehicles, which repeat what the CV edges measured."""
     if base.weights.mode == "paper":
         return _reweighted(base, cv_near=NO_WEIGHT, cv_far=NO_WEIGHT, cp_vehicles=None)
-    return replace(base, cv_inflation=1.0 / NO_WEIGHT)
+    graph = msgspec.structs.replace(base.graph, lasting_share=0.0)  # of an edge without weight nothing lasts
+    return replace(base, cv_inflation=1.0 / NO_WEIGHT, graph=graph)
 
 
 def _reweighted(base: Live, **weights: object) -> Live:

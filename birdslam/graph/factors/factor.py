@@ -32,6 +32,7 @@ class GraphFrame:
     vehicles: VehicleNodes  # whose row is a vehicle's in the window
     associations: Associations  # the edges to vehicles of the window
     zero_velocity: bool  # the ego stands, and keeps its pose
+    passed_s: float = 0.0  # since the newest pose of the window
     twist_growth: Triple = (0.0, 0.0, 0.0)  # of the variances of vehicles' twists in a second
     motion: SE2 = _NONE  # of the ego since the frame before
     settled: Sequence[tuple[float, float]] = ()  # landmarks that go on the map, metres in world
@@ -47,7 +48,7 @@ class Linearised:
 
     residual: Sequence[float] | Floats  # k d numbers: measured minus predicted
     # (k d, E) by the ego's poses, or (k d, n) by all of the state; as a list of k d numbers: row i is the unit vector
-    # of the i-th of them. Of edges to single `vehicles` (k, d, 6) by each one's own numbers; as a list of d: the same
+    # of the i-th of them. Of edges to single `vehicles` (k, d, 8) by each one's own numbers; as a list of d: the same
     jacobian: list[int] | Floats
     covs: Floats  # (k, d, d) positive definite: inverses of the edges' information matrices
     # On the squared Mahalanobis distance of an edge: past it the covariance is multiplied by the square of the excess,

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from birdslam.graph.costs import binary_residuals
 from birdslam.graph.factors.factor import Factor, GraphFrame, Linearised
 from birdslam.graph.graph_config import GraphConfig
-from birdslam.graph.state_layout import POSE
-from birdslam.graph.window import Window
+from birdslam.graph.factors.lasting_error import kept, relative_sigmas, sight_factors
+from birdslam.graph.state_layout import LASTING, OF_VEHICLE, POSE
+from birdslam.graph.vehicles import SHORTEST_S
+from birdslam.graph.window import PLACE, Window
 
 OWN_POSE = [*range(POSE.start, POSE.stop)]
 
@@ -23,20 +27,38 @@ class VehicleDetections(Factor):
     def __init__(self, config: GraphConfig) -> None:
         self._gate = config.detection_gate_sigma**2
         self._front_back_ambiguity = config.front_back_ambiguity
+        self._share, self._memory_s = config.lasting_share, config.lasting_s
 
     def predict(self, frame: GraphFrame, window: Window) -> None:
-        """Turns vehicles round whose detection contradicts their heading by more than a right angle."""
+        """How much of the errors of the last edges these have, too.
+
+        Turns vehicles round whose detection contradicts their heading by more than a right angle.
+        """
         edges = frame.associations.cv
+        if self._share and edges.rows:
+            sigma_rel = relative_sigmas(edges, sight_factors(edges.at, edges.covs))
+            passed_s, motion = frame.passed_s, frame.motion
+            ego_mps = math.hypot(motion.x_m, motion.y_m) / max(passed_s, SHORTEST_S)
+            dt_s = frame.associations.dt_s[edges.rows]
+            same = kept(sigma_rel, window.sigma_rel[edges.rows], dt_s, ego_mps, self._memory_s)
+            window.fade_lasting(edges.rows, same, sigma_rel)
         if self._front_back_ambiguity and edges.rows:
             opposed = (edges.heading * window.heading[window.nodes :][edges.rows].conj()).real < 0.0
             if opposed.any():
                 window.flip_headings([edges.rows[k] for k in np.flatnonzero(opposed)])
 
     def linearise(self, frame: GraphFrame, window: Window) -> Linearised | None:
-        """Each edge measures the three numbers of its vehicle's pose."""
+        """Each edge measures the three numbers of its vehicle's pose, with an error of which a share lasts."""
         edges = frame.associations.cv
         if not edges.rows:
             return None
         at, heading = window.at[window.nodes :][edges.rows], window.heading[window.nodes :][edges.rows]
         residuals = binary_residuals(edges.at, edges.heading, at, heading)  # Eq. 6: its CV edges
-        return Linearised(residuals, OWN_POSE, edges.covs, self._gate, edges.rows)
+        if not self._share:
+            return Linearised(residuals, OWN_POSE, edges.covs, self._gate, edges.rows)
+        J, covs = np.zeros((len(edges.rows), 3, OF_VEHICLE)), edges.covs.copy()
+        J[:, POSE, POSE] = np.eye(3)
+        J[:, PLACE, LASTING] = math.sqrt(self._share) * sight_factors(edges.at, edges.covs)
+        covs[:, PLACE] *= math.sqrt(1.0 - self._share)
+        covs[:, :, PLACE] *= math.sqrt(1.0 - self._share)
+        return Linearised(residuals, J, covs, self._gate, edges.rows)
