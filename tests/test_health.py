@@ -349,7 +349,7 @@ def test_the_doctor_finds_what_is_wrong(tmp_path: Path, monkeypatch: pytest.Monk
     assert (cores.verdict, "perceive: 9999" in cores.found) == ("warning", True)
     many = msgspec.structs.replace(healthy, perceive=PerceiveConfig(opencv_threads=64))
     assert findings_of("threads", many).verdict == "warning"
-    assert findings_of("threads", healthy).found.endswith("OpenCV 2, BLAS 1")
+    assert findings_of("threads", healthy).found.endswith("OpenCV 1, BLAS 1")
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "sched_setscheduler", refused)

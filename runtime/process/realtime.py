@@ -108,6 +108,16 @@ def below_frames() -> None:
         wake_soon([thread], 0)
 
 
+def as_frames() -> None:
+    """The calling thread shares the interpreter's lock with the frames, and computes between them.
+
+    Were it to wait for a core while it holds the lock, so would the frames: it goes before the networks as they do. It
+    has that from the frames' thread, which began it. At SCHED_FIFO it is one below, since there none of them waits.
+    """
+    if os.sched_getscheduler(0) == os.SCHED_FIFO:
+        lower_priority()
+
+
 def lower_priority() -> None:
     """Lowers the calling thread's priority below the others of its process and the other nodes."""
     below_frames()
