@@ -369,9 +369,12 @@ class Lane(msgspec.Struct, frozen=True, kw_only=True, gc=False):
         return _curve_sigma(self.cov, x_m)
 
     def __post_init__(self) -> None:
-        check_finite(self, "offset_m", "slope", "curvature_per_m", "curvature_rate_per_m2")
-        check_finite(self, "width_m", "width_slope", "width_sigma_m", "to_m")
-        _check_cov(self, "cov")
+        shape = self.offset_m + self.slope + self.curvature_per_m + self.curvature_rate_per_m2
+        total = shape + self.width_m + self.width_slope + self.width_sigma_m + self.to_m + sum(self.cov)
+        if not _is_sound(total, *self.cov[::5]):
+            check_finite(self, "offset_m", "slope", "curvature_per_m", "curvature_rate_per_m2")
+            check_finite(self, "width_m", "width_slope", "width_sigma_m", "to_m")
+            _check_cov(self, "cov")
 
 
 class LaneChange(Word):

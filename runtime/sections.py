@@ -134,7 +134,7 @@ class PerceiveConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     # The same in periods of the source's frames: the rest of a period is for what comes after the networks
     deadline_periods: Positive = 0.75
     period_ms: Positive | None = None  # from one frame of the source to the next; None: by the frame rate
-    opencv_threads: PositiveInt = 2  # of OpenCV in perceive
+    opencv_threads: PositiveInt = 1  # of OpenCV in perceive: a second one spins, and takes the networks' core
     provider: Provider = "auto"  # what computes the networks (runtime/models/providers.py)
     schedule: ScheduleConfig = ScheduleConfig()
     looks: LooksConfig = LooksConfig()

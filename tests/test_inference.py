@@ -131,7 +131,33 @@ def test_what_runs_aside_begins_when_its_frame_is_over(made: Made) -> None:
     assert last.done()
 
 
+def test_what_runs_aside_lets_each_further_frame_pass(made: Made) -> None:
+    with made(Gated("detector"), Gated("segmenter"), 1.0) as networks:
+        first, second = threading.Event(), threading.Event()
+
+        def parts() -> None:
+            first.set()
+            networks.lane_head.give_way()
+            second.set()
+
+        aside = networks.aside
+        assert aside is not None
+        networks.start(frame(0))
+        future = aside(lambda: (begun.wait(60.0), parts()))
+        begun = threading.Event()
+        networks.over()
+        networks.start(frame(1))  # comes while the first part is at work
+        begun.set()
+        assert first.wait(60.0)
+        assert not second.wait(0.05)
+        networks.over()
+        future.result(timeout=60.0)
+        assert second.is_set()
+
+
 def test_at_rate_max_nothing_runs_aside(made: Made) -> None:
     detector, segmenter = Gated("detector"), Gated("segmenter")
     with made(detector, segmenter, 1.0, rate="max") as networks:
         assert networks.aside is None
+        networks.start(frame(0))
+        networks.lane_head.give_way()  # at once: lanes are found within the frame

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from pathlib import Path
 
 import cv2
@@ -353,6 +354,57 @@ def test_the_leader_is_the_nearest_in_the_egos_lane() -> None:
     standing = with_users(lanes, cars, 0.0, Traffic()).leader
     assert standing is not None
     assert standing.time_gap_s is None
+
+
+def crowd(count: int) -> list[UserInEgo]:
+    rng = np.random.default_rng(count)
+    cov = np.diag([0.5, 0.1, 3.0])
+    return [UserInEgo(k, SE2(rng.uniform(2, 60), rng.uniform(-9, 9), 0.0), cov, 4.0, 1.5) for k in range(count)]
+
+
+def test_places_are_by_the_lanes_own_bounds_and_sigmas() -> None:
+    lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0, 0.0)
+    users = crowd(30)
+    for user, place in zip(users, with_users(lanes, users, 10.0, Traffic()).vehicles, strict=True):
+        own, x, y = lanes.ego, user.T_ego_vehicle.x_m, user.T_ego_vehicle.y_m
+        assert own is not None
+        bend = 0.001 * max(0.0, x - own.to_m) ** 2
+        sigma = math.sqrt(0.1 + own.sigma_m(min(x, own.to_m)) ** 2 + bend**2 + 1e-6)
+        inside = math.erf((own.left_m(x) - y) / sigma / math.sqrt(2)) - math.erf(
+            (own.right_m(x) - y) / sigma / math.sqrt(2)
+        )
+        assert place.ego_lane == pytest.approx(0.5 * inside, abs=1e-9)
+
+
+def test_a_further_road_user_costs_few_calls() -> None:
+    """All are placed at once; one by one, lane by lane and line by line it was half of the optimizer's step."""
+    lanes = EgoLane().lanes(tuple(line(k, 8.7 - 3.5 * k) for k in range(6)), 0, 0.0)
+
+    def calls_for(count: int) -> int:
+        users, calls = crowd(count), [0]
+
+        def counting(frame: object, event: str, argument: object) -> None:
+            calls[0] += event == "call"
+
+        before = sys.getprofile()
+        sys.setprofile(counting)
+        try:
+            with_users(lanes, users, 10.0, Traffic())
+        finally:
+            sys.setprofile(before)
+        return calls[0]
+
+    assert (calls_for(40) - calls_for(20)) / 20 < 60  # 600 before
+
+
+def test_curves_move_together_as_each_alone() -> None:
+    rng = np.random.default_rng(0)
+    old, step = rng.normal(size=(5, 4)) * [3.0, 0.1, 5e-3, 5e-5], SE2(1.2, -0.1, 0.05)
+    new, J = moved(old, step)
+    for k in range(5):
+        alone, of_it = moved(old[k], step)
+        assert np.array_equal(new[k], alone)
+        assert np.array_equal(J[k], of_it)
 
 
 def test_who_walks_is_in_a_lane_and_leads_nobody_who_cycles_does() -> None:

@@ -94,6 +94,26 @@ def test_lanes_are_found_on_their_schedule_and_say_their_age(every: int) -> None
     assert not any(n.status for n in news)
 
 
+def test_it_gives_way_to_frames_between_its_parts() -> None:
+    """One run of all parts is 15 ms of the interpreter that the frames need, too."""
+    ways, image = [0], np.full((CAMERA.height_px, CAMERA.width_px), 90, np.uint8)
+
+    def give_way() -> None:
+        ways[0] += 1
+
+    polite, plain = Driver(LaneHead(Counted(), None, 3, give_way=give_way)), Driver(LaneHead(Counted(), None, 3))
+    for k in range(7):
+        before = ways[0]
+        found = [
+            drive.mapper.map_lanes(
+                k, SE2(STEP_M * k), CAMERA.ground, SIGMA_TILT, MASKS, k, NOBODY, image, 30_000_000 * k
+            )
+            for drive in (polite, plain)
+        ]
+        assert found[0] == found[1]
+        assert ways[0] - before >= (7 if k % 3 == 0 else 2)
+
+
 def test_a_busy_computer_finds_them_less_often() -> None:
     complete, sparing = Counted(), [1]
     drive = Driver(LaneHead(complete, None, 3, lambda: sparing[0]))

@@ -137,3 +137,17 @@ def test_a_thread_that_gives_way_is_alone_in_that() -> None:
     thread.join()
     assert nice["behind"] == min(before + 5, 19)
     assert os.getpriority(os.PRIO_PROCESS, threading.get_native_id()) == before
+
+
+def test_who_shares_the_interpreter_with_the_frames_has_their_priority() -> None:
+    """Were it to wait for a core while it holds the interpreter's lock, the frames would wait with it."""
+    nice: dict[str, int] = {}
+
+    def beside() -> None:
+        realtime.as_frames()
+        nice["beside"] = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+
+    thread = threading.Thread(target=beside)
+    thread.start()
+    thread.join()
+    assert nice["beside"] == os.getpriority(os.PRIO_PROCESS, threading.get_native_id())

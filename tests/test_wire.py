@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import random
+import struct
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -507,6 +508,48 @@ def test_what_is_not_finite_is_never_sent() -> None:
 
     with pytest.raises(WireError, match="finite"):
         encode(Unchecked(math.nan))
+
+
+def test_bytes_that_only_look_like_another_number_are_taken() -> None:
+    """The quick look at the bytes errs on the careful side alone."""
+    (looks_so,) = struct.unpack(">d", b"\x3f\xcb\x7f\xf8\xcb\xff\xff\x00")
+    for height_m in (looks_so, 1.7e308, -1.7e308, 5e-324):
+        assert decode(encode(Ground(height_m=height_m)), Ground).height_m == height_m
+
+
+@given(st.lists(st.floats(), max_size=12), st.integers(0, 3))
+def test_what_is_not_finite_is_seen_among_any_bytes(numbers: list[float], times: int) -> None:
+    class Unchecked(msgspec.Struct):
+        x_m: list[float]
+
+    record = Unchecked(numbers * times)
+    if all(map(math.isfinite, record.x_m)):
+        assert encode(record) == msgpack.packb(msgspec.to_builtins(record))
+    else:
+        with pytest.raises(WireError, match="finite"):
+            encode(record)
+
+
+def test_numbers_are_not_looked_at_one_by_one() -> None:
+    """For a record of thousands of numbers that was three quarters of the time it takes to encode it."""
+    estimate = BY_NAME["Estimate"]
+    crowded = msgspec.structs.replace(estimate, people=estimate.people * 100)
+
+    def calls_for(record: msgspec.Struct) -> int:
+        calls = [0]
+
+        def counting(frame: object, event: str, argument: object) -> None:
+            calls[0] += event == "c_call"
+
+        before = sys.getprofile()
+        sys.setprofile(counting)
+        try:
+            encode(record)
+        finally:
+            sys.setprofile(before)
+        return calls[0]
+
+    assert calls_for(crowded) - calls_for(estimate) < 100
 
 
 def test_a_message_that_is_too_large_is_never_sent() -> None:

@@ -4,10 +4,6 @@ It has the newest ego pose in the world, a few ego poses before it, each vehicle
 leave it are marginalised: in covariance form their rows are dropped, which is exact. All poses but the first are
 *relative to the newest ego*, and so are their errors, in its axes; docs/method.md ("The window") has the state, its
 charts and the reasons. Positions are complex numbers x + iy in metres and headings unit complex numbers e^(i yaw).
-
-The covariance P is kept in the three parts that a frame works on: of the ego's poses, of vehicles with these, and of
-vehicles. Where no edge ties vehicles to each other, nor to the ego's estimate, the last is a block for each of them,
-and what two vehicles have in common is not kept: nothing reads it. docs/method.md says what that leaves out.
 """
 
 from __future__ import annotations
@@ -53,7 +49,9 @@ class WindowState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 class Window:
     """The joint Gaussian of one epoch, which begins at `frame`. `nodes` ego poses are kept beside the newest.
 
-    `together`: vehicles are one block of P, since there are edges that tie them; else each is its own.
+    The covariance P is kept in the three parts that a frame works on: of the ego's poses, of vehicles with these, and
+    of vehicles. `together`: edges tie vehicles, and the last is one block. Else each vehicle has its own, and what two
+    of them have in common is not kept: nothing reads it. docs/method.md ("Vehicles and the ego") says what that is.
     """
 
     def __init__(self, nodes: int, frame: int, together: bool = False) -> None:

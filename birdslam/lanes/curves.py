@@ -31,29 +31,38 @@ def slope_basis(x_m: Floats) -> Floats:
     return out
 
 
-def moved(curve: Floats, T_old_new: SE2) -> tuple[Floats, Floats]:
-    """The curve (4,) in the ego's new frame, and the derivative (4, 4) of the new by the old.
+def across_sigma_m(at: Floats, cov: Floats) -> Floats:
+    """(..., n) 1-sigma of y, by `basis` (..., n, 4) and the covariances (n, 4, 4) of n curves."""
+    variance = ((at[..., None, :] @ cov)[..., 0, :] * at).sum(axis=-1)
+    out: Floats = np.sqrt(np.maximum(variance, 0.0))
+    return out
 
-    The point where the new y axis cuts the curve is found by Newton's method; its tangent and curvature turn with the
+
+def moved(curves: Floats, T_old_new: SE2) -> tuple[Floats, Floats]:
+    """Curves (..., 4) in the ego's new frame, and the derivatives (..., 4, 4) of the new by the old.
+
+    The point where the new y axis cuts a curve is found by Newton's method; its tangent and curvature turn with the
     axes. The rate of curvature is kept.
     """
-    yaw = T_old_new.yaw_rad
-    sin, cos = math.sin(yaw), math.cos(yaw)
-    a, h, c, d = (float(v) for v in curve)
-    x = T_old_new.x_m
+    sin, cos = math.sin(T_old_new.yaw_rad), math.cos(T_old_new.yaw_rad)
+    a, h, c, d = curves[..., 0], curves[..., 1], curves[..., 2], curves[..., 3]
+    x = np.full(a.shape, T_old_new.x_m)
     for _ in range(3):  # (x - x_m) cos + (y - y_m) sin = 0
         y = a + x * (h + x * (c / 2.0 + x * d / 6.0))
         slope = h + x * (c + x * d / 2.0)
-        x -= ((x - T_old_new.x_m) * cos + (y - T_old_new.y_m) * sin) / max(cos + slope * sin, 0.2)
+        x = x - ((x - T_old_new.x_m) * cos + (y - T_old_new.y_m) * sin) / np.maximum(cos + slope * sin, 0.2)
     y = a + x * (h + x * (c / 2.0 + x * d / 6.0))
     slope = h + x * (c + x * d / 2.0)
-    along = max(cos + slope * sin, 0.2)  # dx of the new frame by that of the old
-    a_new = -(x - T_old_new.x_m) * sin + (y - T_old_new.y_m) * cos
-    h_new = (slope * cos - sin) / along
-    c_new = (c + d * x) / along**3
-    J = np.zeros((4, 4))
-    J[0] = basis(np.array(x)) / along
-    J[1] = slope_basis(np.array(x)) / along**2
-    J[2] = np.array([0.0, 0.0, 1.0, x]) / along**3
-    J[3, 3] = 1.0
-    return np.array([a_new, h_new, c_new, d]), J
+    along = np.maximum(cos + slope * sin, 0.2)  # dx of the new frame by that of the old
+    cubed = along * along * along
+    out = np.empty(curves.shape)
+    out[..., 0] = -(x - T_old_new.x_m) * sin + (y - T_old_new.y_m) * cos
+    out[..., 1] = (slope * cos - sin) / along
+    out[..., 2] = (c + d * x) / cubed
+    out[..., 3] = d
+    J = np.zeros((*curves.shape, 4))
+    J[..., 0, :] = basis(x) / along[..., None]
+    J[..., 1, :] = slope_basis(x) / along[..., None] ** 2
+    J[..., 2, 2], J[..., 2, 3] = 1.0 / cubed, x / cubed
+    J[..., 3, 3] = 1.0
+    return out, J

@@ -15,7 +15,7 @@ import numpy as np
 
 from birdslam.geometry.arrays import Bools, Floats, Ints
 from birdslam.geometry.se2 import SE2
-from birdslam.lanes.curves import basis, moved, slope_basis
+from birdslam.lanes.curves import across_sigma_m, basis, moved, slope_basis
 from birdslam.lanes.paint import LinePoints
 from birdslam.lanes.road_view import tilted
 
@@ -99,12 +99,11 @@ class LineFilter:
         step_m = float(np.hypot(T_old_new.x_m, T_old_new.y_m))
         J = np.zeros((4 * count, 4 * count))
         keep = np.exp(-step_m / RATE_MEMORY_M)
-        sideways = np.zeros(4 * count)
-        turned = np.zeros(4 * count)
-        for k, curve in enumerate(self.curves):
-            part = slice(4 * k, 4 * k + 4)
-            self.curves[k], J[part, part] = moved(curve, T_old_new)
-            sideways[4 * k], turned[4 * k + 1] = -1.0, -1.0
+        sideways = np.tile([-1.0, 0.0, 0.0, 0.0], count)
+        turned = np.tile([0.0, -1.0, 0.0, 0.0], count)
+        self.curves, blocks = moved(self.curves, T_old_new)
+        for k, block in enumerate(blocks):
+            J[4 * k : 4 * k + 4, 4 * k : 4 * k + 4] = block
         J[3::4] *= keep
         self.curves[:, 3] *= keep
         self.cov = J @ self.cov @ J.T + _together(WALK_SHAPE**2 * step_m, WALK_OWN**2 * step_m, count)
@@ -122,9 +121,7 @@ class LineFilter:
 
     def across_sigma_m(self, k: int, x_m: Floats) -> Floats:
         """(N,) 1-sigma of a line's y at x (N,)."""
-        at = basis(x_m)
-        out: Floats = np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", at, self.block(k), at), 0.0))
-        return out
+        return across_sigma_m(basis(x_m), self.block(k))
 
     def update(
         self,

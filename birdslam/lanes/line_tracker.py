@@ -6,6 +6,7 @@ says where each is, and only what lies on no known line can be a new one.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import msgspec
@@ -46,9 +47,15 @@ PROFILE_M = 4.0, 22.0  # where paint and gaps are resolved
 class LineTracker:
     """State: the filter, in the ego's frame at `T_world_filter`, and its lines' tracks."""
 
-    def __init__(self, camera: Camera, certain_m: float = CERTAIN_M) -> None:
-        """`certain_m` metres of evidence make a line sure in its first image."""
+    def __init__(
+        self, camera: Camera, certain_m: float = CERTAIN_M, give_way: Callable[[], object] = lambda: None
+    ) -> None:
+        """`certain_m` metres of evidence make a line sure in its first image.
+
+        `give_way` is called between the parts of an update (lane_mapper.LaneHead).
+        """
         self.camera = camera
+        self._give_way = give_way
         self._certain_m = certain_m
         self._next = 0
         self.clear()
@@ -87,7 +94,9 @@ class LineTracker:
             return
         view = road_view(self.camera, ground, image, segmentation, boxes_px, bonnet_px)
         self._road_from_m = nearest_m(self.camera, ground, bonnet_px)
+        self._give_way()
         paint = paint_points(view)
+        self._give_way()
         first_tilt_rad = 0.0
         if not len(self._filter):
             shape, found = self._search(view, paint, sigma_pitch_rad if search_tilt else 0.0)
@@ -96,6 +105,7 @@ class LineTracker:
             return
         points, of, seen = self._correct(view, paint, sigma_pitch_rad, travelled_m, first_tilt_rad)
         if self._is_lost(paint, seen):
+            self._give_way()
             shape, found = self._search(view, paint, 0.0)
             before = _explained_m(paint, self._tracks, seen)
             if sum(peak.evidence_m for kind, peak in found if kind == PAINT) > BETTER * before:
@@ -104,6 +114,7 @@ class LineTracker:
         if not self._filter.sound().all():
             self._keep_sound()
             return
+        self._give_way()
         self._judge(view, points, seen)
         self._add_lines(points, of, seen, ground.height_m)
         self._drop_lines()
@@ -298,7 +309,7 @@ class LineTracker:
             self._T_world_filter or SE2(),
             tuple(msgspec.structs.replace(self._tracks[k]) for k in sure),
             self._filter.curves[sure].copy(),
-            tuple(self._filter.block(k).copy() for k in sure),
+            np.array([self._filter.block(k) for k in sure]).reshape(-1, 4, 4),
             self.tilt_rad,
             self._height_m,
             self._sigma_roll_rad,

@@ -6,8 +6,10 @@ import math
 from collections.abc import Sequence
 
 import msgspec
+import numpy as np
 
-from birdslam.lanes.traffic import Traffic
+from birdslam.lanes.curves import across_sigma_m, basis, slope_basis
+from birdslam.lanes.traffic import Traffic, lines_between
 from birdslam.lanes.users import SLOW_MPS, UserInEgo
 from birdslam.types import Lane, Lanes, Leader, VehicleLane
 
@@ -24,8 +26,13 @@ def with_users(lanes: Lanes, users: Sequence[UserInEgo], ego_mps: float, traffic
     if not lanes.lanes or not users:
         return traffic.with_directions(lanes)
     near = [user for user in users if abs(user.T_ego_vehicle.x_m) < FARTHEST_M]
-    traffic.observe(lanes, near)
-    placed = [(user, _placed(user, lanes, traffic)) for user in near]
+    between = lines_between(lanes, near)
+    traffic.observe(near, between)
+    shares = _shares(lanes.lanes, near)
+    placed = [
+        (user, _placed(user, lanes.ego_index, share, 0.0 if user.walks else traffic.against(user, line)))
+        for user, share, line in zip(near, shares, between, strict=True)
+    ]
     ahead = [
         (user, where)
         for user, where in placed
@@ -39,19 +46,15 @@ def with_users(lanes: Lanes, users: Sequence[UserInEgo], ego_mps: float, traffic
     )
 
 
-def _placed(user: UserInEgo, lanes: Lanes, traffic: Traffic) -> VehicleLane:
-    x, y = user.T_ego_vehicle.x_m, user.T_ego_vehicle.y_m
-    at_m = min(max(x, 0.0), FARTHEST_M)
-    shares = [_share(lane, at_m, y, float(user.cov[1, 1])) for lane in lanes.lanes]
+def _placed(user: UserInEgo, index: int | None, shares: list[float], against: float | None) -> VehicleLane:
+    """`shares`: the probability of each lane, of which `index` is the ego's; `against`: that it comes towards us."""
     total = sum(shares)
     if total > 1.0:  # neighbours' bounds need not meet
         shares = [share / total for share in shares]
-    index = lanes.ego_index
     ego = 0.0 if index is None else shares[index]
     left = sum(shares[:index] if index is not None else (), 0.0)
     right = sum(shares[index + 1 :] if index is not None else (), 0.0)
     off = max(0.0, 1.0 - ego - left - right)
-    against = 0.0 if user.walks else traffic.against(lanes, user)
     beside, beyond = (AGAINST_BESIDE, AGAINST_BEYOND) if against is None else (against, against)
     beside, beyond = beside * user.drives, beyond * user.drives
     # Who comes towards us drives on a road, also beyond the lanes that are known
@@ -61,16 +64,27 @@ def _placed(user: UserInEgo, lanes: Lanes, traffic: Traffic) -> VehicleLane:
     return VehicleLane(vehicle=user.vehicle, ego_lane=ego, left=left, right=right, oncoming=oncoming, off_road=off)
 
 
-def _share(lane: Lane, x_m: float, y_m: float, variance: float) -> float:
-    """The probability that a point at y, known to `variance`, lies between the lane's bounds at x."""
-    beyond_m = max(0.0, x_m - lane.to_m)
-    known_m = min(x_m, lane.to_m)
-    bend = 0.5 * BEND_SIGMA_PER_M * beyond_m * beyond_m
-    sigma = math.sqrt(variance + lane.sigma_m(known_m) ** 2 + bend * bend + 1e-6)
-    slope = lane.slope + known_m * (lane.curvature_per_m + 0.5 * known_m * lane.curvature_rate_per_m2)
-    centre = lane.centre_m(known_m) + slope * beyond_m
-    half = 0.5 * max(0.0, lane.width_m + lane.width_slope * known_m)
-    return _normal((centre + half - y_m) / sigma) - _normal((centre - half - y_m) / sigma)
+def _shares(lanes: Sequence[Lane], users: Sequence[UserInEgo]) -> list[list[float]]:
+    """The probability that a user, known to its variance across, lies between a lane's bounds: for each user and lane.
+
+    All at once: there are as many pairs as users times lanes in each frame.
+    """
+    rows = [(user.T_ego_vehicle.x_m, user.T_ego_vehicle.y_m, user.cov[1, 1]) for user in users]
+    x_m, y_m, variance = (column[:, None] for column in np.array(rows).reshape(-1, 3).T)  # (users, 1)
+    shapes = [(n.offset_m, n.slope, n.curvature_per_m, n.curvature_rate_per_m2) for n in lanes]
+    curves, covs = np.array(shapes), np.array([lane.cov for lane in lanes]).reshape(-1, 4, 4)
+    to_m, width_m, growth = np.array([(lane.to_m, lane.width_m, lane.width_slope) for lane in lanes]).T
+    at_m = np.clip(x_m, 0.0, FARTHEST_M)
+    known_m, beyond_m = np.minimum(at_m, to_m), np.maximum(at_m - to_m, 0.0)  # (users, lanes)
+    at, bend = basis(known_m), 0.5 * BEND_SIGMA_PER_M * beyond_m * beyond_m
+    sigma = np.sqrt(variance + across_sigma_m(at, covs) ** 2 + bend * bend + 1e-6)
+    centre = (at * curves).sum(axis=2) + (slope_basis(known_m) * curves).sum(axis=2) * beyond_m
+    half = 0.5 * np.maximum(width_m + growth * known_m, 0.0)
+    left, right = ((centre + half - y_m) / sigma).tolist(), ((centre - half - y_m) / sigma).tolist()
+    return [
+        [_normal(a) - _normal(b) for a, b in zip(above, below, strict=True)]
+        for above, below in zip(left, right, strict=True)
+    ]
 
 
 def _normal(z: float) -> float:

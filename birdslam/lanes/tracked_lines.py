@@ -10,7 +10,7 @@ import numpy as np
 
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
-from birdslam.lanes.curves import basis, moved
+from birdslam.lanes.curves import across_sigma_m, basis, moved
 from birdslam.lanes.line_filter import FARTHEST_M, STEEPEST
 from birdslam.types import LaneLine, LineColour, LineKind
 
@@ -48,12 +48,12 @@ class Track(msgspec.Struct):
 
 @dataclass(frozen=True)
 class TrackedLines:
-    """The lines after an update: tracks, curves (n, 4) and covariances (4, 4) in the ego at `T_world_seen`."""
+    """The lines after an update: tracks, curves (n, 4) and covariances (n, 4, 4) in the ego at `T_world_seen`."""
 
     T_world_seen: SE2
     tracks: tuple[Track, ...]
     curves: Floats
-    covs: tuple[Floats, ...]
+    covs: Floats
     tilt_rad: float  # of their image against its pitch
     height_m: float  # of its camera
     sigma_roll_rad: float  # of its ground
@@ -61,43 +61,49 @@ class TrackedLines:
 
     def at(self, T_world_ego: SE2) -> tuple[LaneLine, ...]:
         """The lines in the ego's frame at `T_world_ego`, moved by the ego's motion, from left to right."""
-        step, out = self.T_world_seen.between(T_world_ego), []
-        for track, seen, seen_cov in zip(self.tracks, self.curves, self.covs, strict=True):
-            curve, J = moved(seen, step)
-            cov = J @ seen_cov @ J.T + _systematic(curve, self.height_m, self.sigma_roll_rad)
-            sigma = np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", AHEAD, cov, AHEAD), 0.0))
-            known = AHEAD_M[sigma < WORST_SIGMA_M]
-            if not len(known) or not np.isfinite(cov).all() or abs(curve[0]) > FARTHEST_M or abs(curve[1]) > STEEPEST:
-                continue
-            line = LaneLine(
+        if not self.tracks:
+            return ()
+        step = self.T_world_seen.between(T_world_ego)
+        curves, J = moved(self.curves, step)
+        covs = J @ self.covs @ J.transpose(0, 2, 1) + _systematic(curves, self.height_m, self.sigma_roll_rad)
+        known = across_sigma_m(AHEAD[:, None], covs) < WORST_SIGMA_M  # (distances, lines)
+        sure = known.any(axis=0) & np.isfinite(covs).all(axis=(1, 2))
+        sure &= (np.abs(curves[:, 0]) <= FARTHEST_M) & (np.abs(curves[:, 1]) <= STEEPEST)
+        to_m = np.max(np.where(known, AHEAD_M[:, None], 0.0), axis=0)
+        numbers = zip(self.tracks, curves.tolist(), covs.reshape(-1, 16).tolist(), to_m.tolist(), strict=True)
+        out = [
+            LaneLine(
                 line=track.line,
-                offset_m=float(curve[0]),
-                slope=float(curve[1]),
-                curvature_per_m=float(curve[2]),
-                curvature_rate_per_m2=float(curve[3]),
-                cov=tuple(cov.ravel().tolist()),
+                offset_m=a,
+                slope=h,
+                curvature_per_m=c,
+                curvature_rate_per_m2=d,
+                cov=tuple(cov),
                 seen_from_m=track.seen_from_m - step.x_m,
                 seen_to_m=track.seen_to_m - step.x_m,
-                to_m=float(known[-1]),
+                to_m=farthest_m,
                 kind=_kind(track),
                 colour=_colour(track),
                 existence=existence_of(track),
             )
-            out.append(line)
+            for is_sure, (track, (a, h, c, d), cov, farthest_m) in zip(sure.tolist(), numbers, strict=True)
+            if is_sure
+        ]
         return tuple(sorted(out, key=lambda line: -line.y_m(8.0)))
 
 
-def _systematic(curve: Floats, height_m: float, sigma_roll_rad: float) -> Floats:
-    """(4, 4) what no number of images lessens: errors of the camera's height, which scales a curve, and of its roll.
+def _systematic(curves: Floats, height_m: float, sigma_roll_rad: float) -> Floats:
+    """(n, 4, 4) what no number of images lessens: errors of the camera's height, which scales a curve, and of its roll.
 
     A roll moves a point of the road at y sideways by the height and y^2 over it (Eq. 1): outer lines most.
     """
-    a, h, c, d = curve.tolist()
-    by_height = np.array([a, 0.0, -c, -2.0 * d])
-    by_roll = np.array([a * a, 2.0 * a * h, 2.0 * (h * h + a * c), 6.0 * h * c + 2.0 * a * d]) / height_m
-    by_roll[0] += height_m
-    out: Floats = SIGMA_HEIGHT_REL**2 * np.outer(by_height, by_height) + sigma_roll_rad**2 * np.outer(by_roll, by_roll)
-    out[0, 0] += SIGMA_OFFSET_M**2
+    a, h, c, d = curves.T
+    by_height = np.stack([a, np.zeros(len(a)), -c, -2.0 * d], axis=1)
+    by_roll = np.stack([a * a, 2.0 * a * h, 2.0 * (h * h + a * c), 6.0 * h * c + 2.0 * a * d], axis=1) / height_m
+    by_roll[:, 0] += height_m
+    out: Floats = SIGMA_HEIGHT_REL**2 * by_height[:, :, None] * by_height[:, None]
+    out += sigma_roll_rad**2 * by_roll[:, :, None] * by_roll[:, None]
+    out[:, 0, 0] += SIGMA_OFFSET_M**2
     return out
 
 

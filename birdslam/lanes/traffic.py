@@ -11,7 +11,9 @@ import math
 from collections.abc import Sequence
 
 import msgspec
+import numpy as np
 
+from birdslam.lanes.curves import across_sigma_m, basis
 from birdslam.lanes.users import UserInEgo
 from birdslam.types import Lane, LaneLine, Lanes
 
@@ -40,13 +42,12 @@ class Traffic:
         """As it stands between two frames."""
         return TrafficState(dict(self._log_odds), list(self._counted))
 
-    def observe(self, lanes: Lanes, users: Sequence[UserInEgo]) -> None:
-        """What the road users of a frame show of the lines between them and the ego."""
-        for user in users:
+    def observe(self, users: Sequence[UserInEgo], between: Sequence[LaneLine | None]) -> None:
+        """What the road users of a frame show of the lines between them and the ego (`lines_between`)."""
+        for user, line in zip(users, between, strict=True):
             along = user.cos_along
             if user.walks or along is None or abs(along) < -AGAINST:
                 continue
-            line = _between(lanes, user)
             if line is None or (line.line, user.vehicle) in self._counted:
                 continue
             self._counted[line.line, user.vehicle] = None
@@ -57,12 +58,14 @@ class Traffic:
         while len(self._counted) > MEMORY_LINES:
             del self._counted[next(iter(self._counted))]
 
-    def against(self, lanes: Lanes, user: UserInEgo) -> float | None:
-        """The probability that a road user moves against the ego's direction, were it to move; None: nothing shows."""
+    def against(self, user: UserInEgo, line: LaneLine | None) -> float | None:
+        """The probability that a road user moves against the ego's direction, were it to move; None: nothing shows.
+
+        `line` is the one between it and the ego's lane.
+        """
         along = user.cos_along
         if along is not None:
             return 1.0 if along < AGAINST else 0.0
-        line = _between(lanes, user)
         odds = None if line is None else self._log_odds.get(line.line)
         return None if odds is None else 1.0 / (1.0 + math.exp(-odds))
 
@@ -87,16 +90,18 @@ class Traffic:
         return lane
 
 
-def _between(lanes: Lanes, user: UserInEgo) -> LaneLine | None:
-    """The line nearest to a road user, of those that surely lie between it and the ego's lane; None: there is none."""
-    x, y = user.T_ego_vehicle.x_m, user.T_ego_vehicle.y_m
-    found: LaneLine | None = None
-    for line in lanes.lines:
-        at_m = min(max(x, 0.0), line.to_m)
-        line_m = line.y_m(at_m)
-        margin_m = BEYOND_SIGMAS * math.sqrt(max(float(user.cov[1, 1]), 0.0) + line.sigma_m(at_m) ** 2)
-        if line.offset_m * y <= 0.0 or (y - line_m) * math.copysign(1.0, y) < margin_m:
-            continue
-        if found is None or abs(line_m) > abs(found.y_m(min(max(x, 0.0), found.to_m))):
-            found = line
-    return found
+def lines_between(lanes: Lanes, users: Sequence[UserInEgo]) -> list[LaneLine | None]:
+    """For each road user the nearest line of those that surely lie between it and the ego's lane, or None."""
+    if not lanes.lines or not users:
+        return [None] * len(users)
+    rows = [(user.T_ego_vehicle.x_m, user.T_ego_vehicle.y_m, user.cov[1, 1]) for user in users]
+    x_m, y_m, variance = (column[:, None] for column in np.array(rows).T)  # (users, 1)
+    shapes = [(n.offset_m, n.slope, n.curvature_per_m, n.curvature_rate_per_m2) for n in lanes.lines]
+    curves, covs = np.array(shapes), np.array([line.cov for line in lanes.lines]).reshape(-1, 4, 4)
+    at = basis(np.clip(x_m, 0.0, [line.to_m for line in lanes.lines]))  # (users, lines, 4)
+    line_m = (at * curves).sum(axis=2)
+    margin_m = BEYOND_SIGMAS * np.sqrt(np.maximum(variance, 0.0) + across_sigma_m(at, covs) ** 2)
+    beyond = (curves[:, 0] * y_m > 0.0) & ((y_m - line_m) * np.copysign(1.0, y_m) >= margin_m)
+    farthest = np.where(beyond, np.abs(line_m), -1.0)
+    nearest, found = farthest.argmax(axis=1).tolist(), beyond.any(axis=1).tolist()
+    return [lanes.lines[k] if is_there else None for k, is_there in zip(nearest, found, strict=True)]

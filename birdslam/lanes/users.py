@@ -50,13 +50,16 @@ class UserInEgo:
 
 def person_in_ego(person: FollowedPerson) -> UserInEgo:
     """Somebody on foot or on a bicycle, who heads where they move."""
-    velocity = np.array([person.vx_mps, person.vy_mps])
-    speed_mps = float(np.hypot(*velocity))
-    across = np.array([-velocity[1], velocity[0]]) / max(speed_mps, SLOW_MPS)
+    vx, vy = person.vx_mps, person.vy_mps
+    speed_mps = math.hypot(vx, vy)
+    xx, xy, yx, yy = person.velocity_cov
+    unit_mps = max(speed_mps, SLOW_MPS)
+    across_x, across_y = -vy / unit_mps, vx / unit_mps
+    across = across_x * (xx * across_x + xy * across_y) + across_y * (yx * across_x + yy * across_y)
     cov = np.zeros((3, 3))
-    cov[:2, :2] = np.reshape(person.cov, (2, 2))
-    cov[2, 2] = across @ np.reshape(person.velocity_cov, (2, 2)) @ across / max(speed_mps, 1e-3) ** 2
-    pose = SE2(person.x_m, person.y_m, math.atan2(velocity[1], velocity[0]))
-    sigma_mps = float(np.sqrt(max(person.velocity_cov[0], person.velocity_cov[3], 0.0)))
+    cov[0, 0], cov[0, 1], cov[1, 0], cov[1, 1] = person.cov
+    cov[2, 2] = across / max(speed_mps, 1e-3) ** 2
+    pose = SE2(person.x_m, person.y_m, math.atan2(vy, vx))
+    sigma_mps = math.sqrt(max(xx, yy, 0.0))
     walks = person.label != "cyclist"
     return UserInEgo(person.person, pose, cov, person.length_m, speed_mps, sigma_mps, person.standing, walks)

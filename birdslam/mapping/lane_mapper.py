@@ -43,13 +43,15 @@ class LaneHead:
 
     `complete` is the network that completes the grids where something occluded the road; None: not completed. `submit`
     runs a function in the background; None: within the frame. Lanes are detected after `every` frames, times
-    `slowdown()`, which a busy computer raises.
+    `slowdown()`, which a busy computer raises. Between its parts of two milliseconds or so the detection calls
+    `give_way`: in the background it waits there for the frames, which need the same interpreter.
     """
 
     complete: Completion | None = None
     submit: Submit | None = None
     every: int = 1
     slowdown: Callable[[], int] = lambda: 1
+    give_way: Callable[[], object] = lambda: None
 
 
 @dataclass(frozen=True)
@@ -117,8 +119,8 @@ class LaneMapper:
         self.edges = edges
         self.head = head
         self._submit = head.submit or _run_now
-        self._amodal = AmodalLanes(lanes, head.complete)
-        self._tracker, self._ego_lane = LineTracker(camera), EgoLane()
+        self._amodal = AmodalLanes(lanes, head.complete, head.give_way)
+        self._tracker, self._ego_lane = LineTracker(camera, give_way=head.give_way), EgoLane()
         self._lines: tuple[int, TrackedLines] | None = None  # and the source time of their image
         self._frames: deque[_PastFrame] = deque(maxlen=REMEMBERED_FRAMES)
         self._images: deque[tuple[int, NDArray[np.uint8]]] = deque(maxlen=REMEMBERED_IMAGES)
@@ -272,6 +274,7 @@ class LaneMapper:
                 bonnet_px=bonnet_px,
             )
             lines = self._tracker.lines()
+            self.head.give_way()
         road_m, boundary_m = points_of(segmentation, self.camera, then.ground, boxes_px, self._amodal.config)
         on_world_m = then.T_world_ego @ boundary_m
         found = lane_stations(
@@ -285,7 +288,9 @@ class LaneMapper:
             self.edges,
         )
         self._amodal.add(then.T_world_ego, road_m, boundary_m)
+        self.head.give_way()
         points_m, lanes = self._lanes_m(T_world_ego) if due else (np.zeros((0, 2)), np.zeros(0, dtype=np.int64))
+        self.head.give_way()
         seen_m = then.T_world_ego @ self._points_m(segmentation, then.ground, boxes_px)
         seen_m = seen_m[self._amodal.ids.lookup(seen_m) == NO_LANE]
         if len(points_m):

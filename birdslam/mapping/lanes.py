@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -75,9 +75,13 @@ class Completion(Protocol):
 class AmodalLanes:
     """`add` for each segmented frame, then `lanes` in the ego of any later pose. Deterministic."""
 
-    def __init__(self, config: LanesConfig, complete: Completion | None = None) -> None:
+    def __init__(
+        self, config: LanesConfig, complete: Completion | None = None, give_way: Callable[[], object] = lambda: None
+    ) -> None:
+        """`give_way` is called between the parts of `lanes` (lane_mapper.LaneHead)."""
         self.config = config
         self.complete = complete
+        self._give_way = give_way
         self.completion_failed = False  # in the last run: its output was not finite and not used
         self._frames: deque[tuple[SE2, tuple[Points, Points]]] = deque(maxlen=config.window_frames)
         self.ids = LaneIds(config.same_lane_m, config.cell_m, config.remembered_m)
@@ -103,7 +107,9 @@ class AmodalLanes:
     def lanes(self, T_world_ego: SE2) -> tuple[LaneCloud, ...]:
         """The lanes around the ego at `T_world_ego`, each with its id."""
         grids = self.grids(T_world_ego)
+        self._give_way()
         completed = None if self.complete is None else self.complete(grids)
+        self._give_way()
         self.completion_failed = completed is not None and not np.isfinite(completed).all()
         if completed is None or self.completion_failed:
             return self.ids.assign(T_world_ego, segregate(grids, self.config))

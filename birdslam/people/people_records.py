@@ -23,38 +23,39 @@ def followed_people(tracker: PeopleTracker, present: EgoFrame) -> tuple[Followed
     stand = np.array([track.stands and track.hits >= KNOWN_FRAMES for track in tracks], dtype=np.bool_)
     moments = tracker.filter.moments(after_s, stand)
     R, T = present.T_world_ego.rotation(), present.T_world_ego
-    at = (moments.mean[:, :2] - [T.x_m, T.y_m]) @ R
-    velocity = moments.mean[:, VX:HEIGHT] @ R
-    cov = (R.T @ moments.cov[:, :2, :2] @ R).reshape(-1, 4)
-    velocity_cov = (R.T @ moments.cov[:, VX:HEIGHT, VX:HEIGHT] @ R).reshape(-1, 4)
-    sigma = np.sqrt(moments.cov[:, HEIGHT, HEIGHT])
-    out = []
+    at = ((moments.mean[:, :2] - [T.x_m, T.y_m]) @ R).tolist()
+    velocity = (moments.mean[:, VX:HEIGHT] @ R).tolist()
+    cov = (R.T @ moments.cov[:, :2, :2] @ R).reshape(-1, 4).tolist()
+    velocity_cov = (R.T @ moments.cov[:, VX:HEIGHT, VX:HEIGHT] @ R).reshape(-1, 4).tolist()
+    log_height, sigma = moments.mean[:, HEIGHT].tolist(), np.sqrt(moments.cov[:, HEIGHT, HEIGHT]).tolist()
+    child, standing = (np.clip(share, 0.0, 1.0).tolist() for share in (moments.child, moments.standing))
+    stands, out = stand.tolist(), []
     for k, track in enumerate(tracks):
         if track.person < 0:
             continue
-        height_m = math.exp(float(moments.mean[k, HEIGHT]))
+        height_m = math.exp(log_height[k])
         sizes = tracker.config.people.sizes(track.label)
-        vx, vy = velocity[k].tolist()
-        moves = Moves.STANDING if stand[k] else Moves.DRIVING if track.hits >= KNOWN_FRAMES else Moves.UNDECIDED
+        (x, y), (vx, vy) = at[k], velocity[k]
+        moves = Moves.STANDING if stands[k] else Moves.DRIVING if track.hits >= KNOWN_FRAMES else Moves.UNDECIDED
         out.append(
             FollowedPerson(
                 person=track.person,
-                x_m=float(at[k, 0]),
-                y_m=float(at[k, 1]),
-                cov=_symmetric(cov[k].tolist()),
+                x_m=x,
+                y_m=y,
+                cov=_symmetric(cov[k]),
                 vx_mps=vx,
                 vy_mps=vy,
-                velocity_cov=_symmetric(velocity_cov[k].tolist()),
+                velocity_cov=_symmetric(velocity_cov[k]),
                 label=track.label,
                 label_probability=track.label_probability,
                 score=track.box.score,
                 box_px=track.box.box_px,
                 height_m=height_m,
-                sigma_height_m=height_m * float(sigma[k]),
-                child=min(1.0, max(0.0, float(moments.child[k]))),
+                sigma_height_m=height_m * sigma[k],
+                child=child[k],
                 length_m=sizes.length_m,
                 width_m=sizes.footprint_m,
-                standing=min(1.0, max(0.0, float(moments.standing[k]))),
+                standing=standing[k],
                 moves=moves,
                 age_ns=max(0, present.t_source_ns - track.seen_ns),
                 frames=track.hits,

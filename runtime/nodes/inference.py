@@ -96,7 +96,7 @@ class Inference(Closing):
         self._started: list[Future[Any]] = []  # for the frame at hand, and awaited
         self._threads = ThreadPoolExecutor(max(1, len(heads)), "network", initializer=realtime.below_frames)
         self._behind = ThreadPoolExecutor(max(1, len(heads)), "network-behind", initializer=realtime.lower_priority)
-        self._beside = ThreadPoolExecutor(1, "beside", initializer=realtime.lower_priority)
+        self._beside = ThreadPoolExecutor(1, "beside", initializer=realtime.as_frames)
         self._frame_over = threading.Event()
         patience_s = None if self._deadline_ns is None else 0.0
         self.networks = Networks(
@@ -161,13 +161,19 @@ class Inference(Closing):
     def aside(self) -> Run | None:
         """Runs a function on a thread of its own; None at rate "max", where nothing may depend on the clock.
 
-        It begins when the frame at hand is over: it would take the interpreter's lock from what goes out.
+        It begins when the frame at hand is over: it would take the interpreter's lock from what goes out. A frame that
+        comes meanwhile it lets pass, where it calls `give_way`.
         """
         return None if self._deadline_ns is None else self._run_aside
 
+    def give_way(self) -> None:
+        """Waits for the end of the frame at hand, if there is one."""
+        if self._deadline_ns is not None:
+            self._frame_over.wait()
+
     def _run_aside(self, run: Run, *arguments: Any) -> Future[Any]:
         def when_over() -> Any:
-            self._frame_over.wait()
+            self.give_way()
             return run(*arguments)
 
         return self._beside.submit(when_over)
@@ -183,7 +189,11 @@ class Inference(Closing):
     def lane_head(self) -> LaneHead:
         """Lanes, on their schedule; half as often where the networks look less often than on theirs."""
         return LaneHead(
-            self.completion, self.aside, self._lanes_every, lambda: min(self.networks.slowdown, LANES_SPARING)
+            self.completion,
+            self.aside,
+            self._lanes_every,
+            lambda: min(self.networks.slowdown, LANES_SPARING),
+            self.give_way,
         )
 
     @property

@@ -38,7 +38,9 @@ _LOWER_NICE = 5  # nicer: a third of the time that one gets that wants the same 
 _NICEST = 19
 
 NODE_IMAGES = {"capture": 8, "perceive": 40}  # of the camera's size, in colour, that a node has at once at its worst
-NODE_OBJECTS_MIB, NODE_HEAP_MIB = 8.0, 4.0
+# ... and what does not go by the image: in perceive lane grids, and what networks, OpenCV and the solvers hold
+NODE_OBJECTS_MIB, NODE_HEAP_MIB = 8.0, {"perceive": 20.0}
+OTHER_HEAP_MIB = 4.0  # of a node that is not named there
 
 _TUPLE_SIZES, _TUPLES_KEPT = range(1, 21), 2_000  # what CPython keeps of freed ones, of each size
 
@@ -106,6 +108,16 @@ def below_frames() -> None:
         wake_soon([thread], 0)
 
 
+def as_frames() -> None:
+    """The calling thread shares the interpreter's lock with the frames, and computes between them.
+
+    Were it to wait for a core while it holds the lock, so would the frames: it goes before the networks as they do. It
+    has that from the frames' thread, which began it. At SCHED_FIFO it is one below, since there none of them waits.
+    """
+    if os.sched_getscheduler(0) == os.SCHED_FIFO:
+        lower_priority()
+
+
 def lower_priority() -> None:
     """Lowers the calling thread's priority below the others of its process and the other nodes."""
     below_frames()
@@ -167,7 +179,7 @@ def reserve_for(node: str, configuration: Configuration) -> None:
     """`reserve` for what a node makes at work, when all that it loads is there."""
     camera = configuration.camera
     image_mib = 0.0 if camera is None else 3 * camera.width_px * camera.height_px / _MIB
-    reserve(NODE_OBJECTS_MIB, NODE_HEAP_MIB + NODE_IMAGES.get(node, 0) * image_mib)
+    reserve(NODE_OBJECTS_MIB, NODE_HEAP_MIB.get(node, OTHER_HEAP_MIB) + NODE_IMAGES.get(node, 0) * image_mib)
 
 
 def use_one_heap() -> None:
