@@ -26,7 +26,7 @@ from tests.recordings import KITTI as CAMERA
 
 ALL_EDGES = WeightsConfig(leave_out=())
 EQ_6 = GraphConfig(
-    constant_velocity=False, detection_gate_sigma=1e3, vehicles_move_ego=True
+    constant_velocity=False, detection_gate_sigma=1e3, vehicles_move_ego=True, lasting_share=0.0
 )  # the paper's graph, and nothing counts as an outlier
 NO_CP = DriveConfig(landmarks=0, lane_points=0)
 
@@ -79,7 +79,7 @@ def test_equals_gtsam_on_the_papers_edges(drop: float) -> None:
 def test_equals_gtsam_with_the_constant_velocity_factor() -> None:
     """The yaw is known well at once: a vehicle begins at rest, where a yaw that is off does not yet turn its way."""
     world = drive(replace(NO_CP, frames=40, vehicles=3, noise=1e-3, sigma_cv_rad=0.03), seed=12)
-    config = GraphConfig(detection_gate_sigma=1e3, change_sideways_mps=2.0, vehicles_move_ego=True)
+    config = GraphConfig(detection_gate_sigma=1e3, change_sideways_mps=2.0, vehicles_move_ego=True, lasting_share=0.0)
     assert_gtsam_agrees(world, config, WeightsConfig(leave_out=("cp", "vv")), 2e-3)
 
 
@@ -178,10 +178,12 @@ def nees(world: Drive, config: GraphConfig, weights: WeightsConfig) -> dict[str,
 
 
 def assert_graph_is_honest(model: str, world: DriveConfig, seeds: int) -> None:
+    """The graph takes edges' errors to last as those of this world do."""
+    default = GraphConfig(lasting_share=world.lasting_share)
     config, weights = (
-        (GraphConfig(constant_velocity=False, vehicles_move_ego=True), ALL_EDGES)
+        (replace(default, constant_velocity=False, vehicles_move_ego=True), ALL_EDGES)
         if model == "Eq. 6"
-        else (GraphConfig(), WeightsConfig())
+        else (default, WeightsConfig())
     )
     world = replace(world, traffic="road" if model == "Eq. 6" else "drawn")
     found = [nees(drive(world, seed), config, weights) for seed in range(seeds)]
@@ -202,6 +204,17 @@ def test_covariances_are_honest(model: str, outliers: float) -> None:
     """The mean NEES of 100 seeded drives, also with outliers in."""
     world = DriveConfig(frames=40, vehicles=2, landmarks=8, lane_points=0, outliers=outliers)
     assert_graph_is_honest(model, world, seeds=100)
+
+
+def test_errors_that_last_are_not_averaged_away() -> None:
+    """A graph that takes each edge's error for its own is too sure of vehicles by far; by default it is honest."""
+    share = GraphConfig().lasting_share
+    world = DriveConfig(frames=40, vehicles=2, landmarks=8, lane_points=0, lasting_share=share)
+    assert_graph_is_honest("constant velocity", world, seeds=100)
+    independent = GraphConfig(lasting_share=0.0)
+    drawn = replace(world, traffic="drawn")
+    found = [nees(drive(drawn, seed), independent, WeightsConfig()) for seed in range(60)]
+    assert np.mean([of["vehicle"] for of in found if "vehicle" in of]) > 1.5 * 3
 
 
 @pytest.mark.slow

@@ -16,6 +16,7 @@ import numpy as np
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.planar import between, compose, exp
 from birdslam.geometry.se2 import SE2, wrap
+from birdslam.graph.factors.lasting_error import DRIVING_MPS, kept
 from birdslam.types import EgoEdge, LandmarkEdge, LanePoint, Measurements, MotionEdge, Status, VehicleEdge
 
 Count = Annotated[int, msgspec.Meta(ge=0)]
@@ -38,6 +39,10 @@ class DriveConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sigma_cv_rel: NotNegative = 0.03  # of the distance, along the line of sight
     sigma_cv_m: NotNegative = 0.2
     sigma_cv_rad: NotNegative = 0.1
+    # Of the variance of a vehicle's place, how much is that of an error that its next edge has, too, and for how long
+    # (s, of driving), as `GraphConfig` has them
+    lasting_share: Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)] = 0.0
+    lasting_s: Annotated[float, msgspec.Meta(gt=0.0)] = 2.0
     sigma_vv_m: NotNegative = 0.03
     sigma_vv_rad: NotNegative = 0.01
     sigma_cp_m: NotNegative = 0.05
@@ -141,9 +146,12 @@ class _Camera:
         self._rng = rng
         self._landmarks: dict[int, Floats] = {}  # in world
         self._next_landmark = 0
+        self._lasting: dict[int, tuple[Floats, Floats, float]] = {}  # of vehicles: numbers, relative sigmas, when
 
     def measure(self, ego: Floats, vehicles: list[Floats]) -> list[Measurements]:
         config, last = self.config, 0
+        speeds_mps = np.linalg.norm(np.diff(ego[:, :2], axis=0, prepend=ego[:1, :2]), axis=1) * config.rate_hz
+        driven_s = np.cumsum(-np.expm1(-speeds_mps / DRIVING_MPS)) / config.rate_hz
         last_seen: dict[int, int] = {}
         out = []
         for frame in range(config.frames):
@@ -156,7 +164,7 @@ class _Camera:
                 seen = between(ego[frame], poses[frame])
                 if not (3.0 < seen[0] < config.range_m and abs(seen[1]) < seen[0]):
                     continue
-                cv.append(self._vehicle_edge(k, frame, seen))
+                cv.append(self._vehicle_edge(k, frame, seen, driven_s[frame]))
                 before = last_seen.get(k)
                 if before is not None and frame - before < config.rate_hz:
                     motion = between(poses[before], poses[frame])
@@ -194,12 +202,16 @@ class _Camera:
         T, cov = self._noisy(between(ego[before], ego[frame]), np.diag(sigma**2) * (frame - before))
         return EgoEdge(from_frame=before, to_frame=frame, T_from_to=T, cov=cov)
 
-    def _vehicle_edge(self, vehicle: int, frame: int, seen: Floats) -> VehicleEdge:
+    def _vehicle_edge(self, vehicle: int, frame: int, seen: Floats, driven_s: float) -> VehicleEdge:
         """Noise is largest along the line of sight; its axes are those of the measured pose."""
         config, rng = self.config, self._rng
         far_m = float(np.hypot(seen[0], seen[1]))
         sigmas = np.array([config.sigma_cv_m + config.sigma_cv_rel * far_m, config.sigma_cv_m, config.sigma_cv_rad])
-        noise = config.noise * sigmas * rng.standard_normal(3)
+        drawn = rng.standard_normal(3)
+        if config.lasting_share:
+            lasting = self._lasting_error(vehicle, sigmas[:2] / far_m, driven_s)
+            drawn[:2] = np.sqrt(1.0 - config.lasting_share) * drawn[:2] + np.sqrt(config.lasting_share) * lasting
+        noise = config.noise * sigmas * drawn
         sight = np.arctan2(seen[1], seen[0])
         yaw = wrap(float(seen[2] + noise[2]))
         turn = np.eye(3)
@@ -212,6 +224,17 @@ class _Camera:
             T = SE2(T.x_m + rng.uniform(8.0, 30.0), T.y_m + rng.uniform(-10.0, 10.0), T.yaw_rad)
         numbers = tuple((0.5 * (cov + cov.T)).ravel().tolist())
         return VehicleEdge(vehicle=vehicle, frame=frame, T_ego_vehicle=T, cov=numbers)
+
+    def _lasting_error(self, vehicle: int, sigma_rel: Floats, driven_s: float) -> Floats:
+        """(2,) in sigmas, along the line of sight and across it."""
+        new = self._rng.standard_normal(2)
+        if vehicle in self._lasting:
+            before, before_rel, then_s = self._lasting[vehicle]
+            fading_s = np.full(1, driven_s - then_s)
+            same = kept(sigma_rel[None], before_rel[None], fading_s, self.config.lasting_s)[0]
+            new = same * before + np.sqrt(1.0 - same**2) * new
+        self._lasting[vehicle] = new, sigma_rel, driven_s
+        return new
 
     def _landmark_edges(self, frame: int, ego: Floats) -> tuple[LandmarkEdge, ...]:
         """Road points from 4 to 20 m ahead; one that the ego has passed is replaced by a new one far ahead."""

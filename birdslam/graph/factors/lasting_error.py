@@ -8,8 +8,6 @@ of sight and across it, of the vehicle's state. They are considered and not esti
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from birdslam.geometry.arrays import Complexes, Floats
@@ -39,12 +37,11 @@ def relative_sigmas(edges: CvEdges, factors: Floats) -> Floats:
     return out
 
 
-def kept(sigma_rel: Floats, sigma_before_rel: Floats, dt_s: Floats, ego_mps: float, memory_s: float) -> Floats:
-    """(k, 2) how much of the lasting errors is that of the edges before, which came `dt_s` (k,) earlier.
+def kept(sigma_rel: Floats, sigma_before_rel: Floats, driven_s: Floats, memory_s: float) -> Floats:
+    """(k, 2) how much of the lasting errors is that of the edges before, `driven_s` (k,) of driving ago.
 
     A result that has become surer rests on new measurements, one that has become less sure on new errors.
     """
-    driven_s = dt_s * -math.expm1(-ego_mps / DRIVING_MPS)
     more, less = np.maximum(sigma_rel, sigma_before_rel), np.minimum(sigma_rel, sigma_before_rel)
     out: Floats = np.exp(-driven_s / memory_s)[:, None] * less / more
     return out

@@ -9,7 +9,7 @@ import numpy as np
 from birdslam.graph.costs import binary_residuals
 from birdslam.graph.factors.factor import Factor, GraphFrame, Linearised
 from birdslam.graph.graph_config import GraphConfig
-from birdslam.graph.factors.lasting_error import kept, relative_sigmas, sight_factors
+from birdslam.graph.factors.lasting_error import DRIVING_MPS, kept, relative_sigmas, sight_factors
 from birdslam.graph.state_layout import LASTING, OF_VEHICLE, POSE
 from birdslam.graph.vehicles import SHORTEST_S
 from birdslam.graph.window import PLACE, Window
@@ -37,10 +37,9 @@ class VehicleDetections(Factor):
         edges = frame.associations.cv
         if self._share and edges.rows:
             sigma_rel = relative_sigmas(edges, sight_factors(edges.at, edges.covs))
-            passed_s, motion = frame.passed_s, frame.motion
-            ego_mps = math.hypot(motion.x_m, motion.y_m) / max(passed_s, SHORTEST_S)
-            dt_s = frame.associations.dt_s[edges.rows]
-            same = kept(sigma_rel, window.sigma_rel[edges.rows], dt_s, ego_mps, self._memory_s)
+            ego_mps = math.hypot(frame.motion.x_m, frame.motion.y_m) / max(frame.passed_s, SHORTEST_S)
+            driven_s = frame.associations.dt_s[edges.rows] * -math.expm1(-ego_mps / DRIVING_MPS)
+            same = kept(sigma_rel, window.sigma_rel[edges.rows], driven_s, self._memory_s)
             window.fade_lasting(edges.rows, same, sigma_rel)
         if self._front_back_ambiguity and edges.rows:
             opposed = (edges.heading * window.heading[window.nodes :][edges.rows].conj()).real < 0.0

@@ -1,0 +1,69 @@
+"""Laws of the part of a CV edge's error that lasts (graph/factors/lasting_error.py)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from birdslam.geometry.arrays import Floats
+from birdslam.geometry.se2 import SE2
+from birdslam.graph.factors.lasting_error import kept, sight_factors
+from birdslam.graph.graph_config import GraphConfig
+from birdslam.graph.pose_graph import PoseGraph
+from birdslam.graph.weights import WeightsConfig
+from birdslam.types import EgoEdge, Measurements, VehicleEdge
+
+SIGMAS_M = np.array([2.0, 0.3])  # along the line of sight, and across
+EXACT = tuple(np.diag([1e-8, 1e-8, 1e-10]).ravel().tolist())
+positive, numbers = st.floats(1e-3, 1e2), st.floats(-3.0, 3.0)
+
+
+@given(st.floats(0.0, 2.0 * math.pi), st.floats(0.5, 100.0), numbers, numbers, numbers, numbers)
+def test_factors_are_those_of_the_covariance_and_lie_along_the_sight(
+    bearing_rad: float, far_m: float, a: float, b: float, c: float, d: float
+) -> None:
+    A = np.array([[a, b], [c, d]])
+    covs = np.zeros((1, 3, 3))
+    covs[0, :2, :2] = A @ A.T  # singular ones, too
+    at = far_m * np.exp(1j * np.array([bearing_rad]))
+    F = sight_factors(at, covs)
+    np.testing.assert_allclose(F @ F.transpose(0, 2, 1), covs[:, :2, :2], atol=1e-5 * (1.0 + covs.max()))
+    across = np.array([-math.sin(bearing_rad), math.cos(bearing_rad)])
+    np.testing.assert_allclose(abs(across @ F[0, :, 1]), np.linalg.norm(F[0, :, 1]), rtol=1e-9)
+
+
+@given(st.tuples(positive, positive), st.tuples(positive, positive), st.floats(0.0, 100.0), positive)
+def test_an_error_is_kept_in_part_and_whole_where_nothing_changed(
+    now: tuple[float, float], before: tuple[float, float], driven_s: float, memory_s: float
+) -> None:
+    of, driven = kept(np.array([now]), np.array([before]), np.array([driven_s]), memory_s), np.array([driven_s])
+    assert (of >= 0.0).all()
+    assert (of <= 1.0).all()
+    np.testing.assert_array_equal(of, kept(np.array([before]), np.array([now]), driven, memory_s))
+    np.testing.assert_array_equal(kept(np.array([now]), np.array([now]), np.zeros(1), memory_s), 1.0)
+
+
+def variances(frames: int, ego_mps: float, config: GraphConfig) -> Floats:
+    """(2,) of a standing vehicle's place along and across the line of sight, seen in so many frames at 10 Hz."""
+    graph = PoseGraph(config, WeightsConfig())
+    cov = tuple(np.diag([*np.square(SIGMAS_M), 0.01]).ravel().tolist())
+    for k in range(frames):
+        t_ns, step = round(1e8 * k), SE2(ego_mps / 10.0)
+        cc = EgoEdge(from_frame=k - 1, to_frame=k, T_from_to=step, cov=EXACT) if k else None
+        cv = VehicleEdge(vehicle=1, frame=k, T_ego_vehicle=SE2(60.0 - k * step.x_m), cov=cov)
+        graph.optimise(Measurements(frame_id=k, t_source_ns=t_ns, t_capture_ns=t_ns, t_utc_ns=t_ns, cc=cc, cv=(cv,)))
+    ((_, found),) = graph.vehicles_in_ego().values()
+    return np.diag(found)[:2]
+
+
+def test_what_lasts_is_not_averaged_away_however_often_it_is_seen() -> None:
+    steady = {"change_forward_mps": 1e-3, "change_sideways_mps": 1e-3, "birth_forward_mps": 1e-2}
+    config = GraphConfig(**steady, birth_sideways_mps=1e-2)
+    floor = config.lasting_share * np.square(SIGMAS_M)
+    assert (variances(300, 0.0, config) > 0.95 * floor).all()  # an ego that stands sees the same for ever
+    driven, standing = (variances(40, mps, config) for mps in (10.0, 0.0))
+    assert (driven < standing).all()  # new road, new errors
+    assert (variances(300, 0.0, GraphConfig(**steady, birth_sideways_mps=1e-2, lasting_share=0.0)) < 0.1 * floor).all()
