@@ -32,8 +32,8 @@ def minimise(window: Window, of_vehicles: Sequence[Linearised], terms: Sequence[
 
     The edges `of_vehicles` leave the ego's poses where they are; `hold_ego` is of the newest pose alone and of the
     other `terms`; lasting errors of vehicles' edges are held in all. What is held keeps its mean and covariance, and
-    its part in all others' uncertainty: it is considered, not estimated (Schmidt 1966). Notes in each term which of its edges are outliers. Where the numbers
-    leave all bounds, the window is not finite afterwards.
+    its part in all others' uncertainty: it is considered, not estimated (Schmidt 1966). Notes in each term which of its
+    edges are outliers. Where the numbers leave all bounds, the window is not finite afterwards.
     """
     try:
         if window.together:

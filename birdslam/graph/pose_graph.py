@@ -25,10 +25,10 @@ from birdslam.graph.checkpoint import Checkpoint, CheckpointError, Epoch, pack, 
 from birdslam.graph.edges import PoseEdges, pose_edges
 from birdslam.graph.factors.constant_velocity import twist_growth
 from birdslam.graph.factors.factor import Factor, GraphFrame, Linearised
+from birdslam.graph.factors.lasting_error import relative_sigmas, sight_factors
 from birdslam.graph.factors.standard import standard_factors
 from birdslam.graph.factors.vehicle_detection import VehicleDetections
 from birdslam.graph.graph_config import GraphConfig, check_together
-from birdslam.graph.factors.lasting_error import relative_sigmas, sight_factors
 from birdslam.graph.marginals import vehicle_estimates
 from birdslam.graph.minimum import minimise, solver
 from birdslam.graph.pending_map import PendingMap

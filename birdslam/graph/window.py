@@ -326,7 +326,7 @@ class Window:
         self.sigma_rel[seen.rows] = sigma_rel
 
     def fade_lasting(self, rows: Sequence[int], kept: Floats, sigma_rel: Floats) -> None:
-        """The lasting errors of vehicles `rows` (k,) are by `kept` (k, 2) those of their last edges, the rest is new."""
+        """The lasting errors of vehicles `rows` (k,) are by `kept` (k, 2) those of their last edges, the rest new."""
         factor = np.ones((len(self.velocity), OF_VEHICLE))
         factor[rows, LASTING] = kept
         own = factor.reshape(self.of_vehicles.shape[:2])

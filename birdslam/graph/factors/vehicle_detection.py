@@ -8,8 +8,8 @@ import numpy as np
 
 from birdslam.graph.costs import binary_residuals
 from birdslam.graph.factors.factor import Factor, GraphFrame, Linearised
-from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.factors.lasting_error import DRIVING_MPS, kept, relative_sigmas, sight_factors
+from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.state_layout import LASTING, OF_VEHICLE, POSE
 from birdslam.graph.vehicles import SHORTEST_S
 from birdslam.graph.window import PLACE, Window
