@@ -20,12 +20,13 @@ def lane_users(
     people: Sequence[FollowedPerson],
 ) -> list[UserInEgo]:
     """Everybody; `vehicles` are the estimates of `nodes`. The covariances have nothing of the ego's error in world."""
-    T_ego_world, users = window.world.inverse(), []
-    for row, (node, estimate) in enumerate(zip(nodes, vehicles, strict=True)):
+    T_ego_world, users = window.world.inverse(), list[UserInEgo]()
+    states = np.asarray(window.layout.poses[: len(nodes)])
+    covs = window.P[states[:, :, None], states[:, None, :]]  # (vehicles, 3, 3)
+    for node, estimate, cov in zip(nodes, vehicles, covs, strict=True):
         T_ego_vehicle = T_ego_world @ estimate.T_world_vehicle
-        states = window.layout.poses[row]
         by_size = node.size_bias_rel * np.array([T_ego_vehicle.x_m, T_ego_vehicle.y_m, 0.0])  # see marginals.py
-        cov = window.P[np.ix_(states, states)] + np.outer(by_size, by_size)
+        cov += by_size[:, None] * by_size
         yaw_rad = estimate.T_world_vehicle.yaw_rad
         speed_mps = estimate.velocity_mps[0] * math.cos(yaw_rad) + estimate.velocity_mps[1] * math.sin(yaw_rad)
         size = estimate.length_m
