@@ -478,8 +478,8 @@ class Ground(msgspec.Struct, frozen=True, kw_only=True):
 class FollowedPerson(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False):
     """A person or cyclist in one frame, as the front end's filter has followed them until it (people/).
 
-    Place and velocity over the ground are in the axes of this frame's ego. People are filtered outside the joint graph:
-    sixty of them and ten vehicles would not fit into its millisecond; the graph gives them its world and its ego.
+    Place and velocity over the ground are in the axes of this frame's ego. People are filtered outside the graph, which
+    gives them its world and its ego.
     """
 
     person: BodyId  # its number, which no vehicle has

@@ -157,6 +157,15 @@ def test_epochs_do_not_mix_and_the_oldest_go() -> None:
     assert atlas.trajectory() == atlas.trajectory(epoch=3)
 
 
+def test_by_default_the_epoch_before_is_kept_for_its_last_map_updates_and_none_more() -> None:
+    atlas = Atlas(AtlasConfig())
+    for epoch in range(3):
+        atlas.add(at(epoch, SE2(), epoch=epoch))
+    late = MapUpdate(epoch=1, frame_id=1, landmarks_m=((1.0, 0.0),))
+    atlas.add(at(3, SE2(), epoch=2), late)
+    assert atlas.epochs == (1, 2)  # each has as much memory as the newest: the supervisor takes it at its start
+
+
 def test_an_invalid_estimate_leaves_no_pose() -> None:
     atlas = Atlas(SMALL)
     atlas.add(at(0, SE2()))

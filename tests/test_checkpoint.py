@@ -143,7 +143,9 @@ def test_parts_that_do_not_belong_together_are_refused() -> None:
     torn = packed(replace(landmarks, frames=landmarks.frames[1:]))
     for broken in (
         replace(begun, vehicles=begun.vehicles[1:]),
-        replace(begun, window=replace(begun.window, P=begun.window.P[1:])),
+        replace(begun, window=replace(begun.window, of_egos=begun.window.of_egos[1:])),
+        replace(begun, window=replace(begun.window, with_egos=begun.window.with_egos[1:])),
+        replace(begun, window=replace(begun.window, of_vehicles=begun.window.of_vehicles[1:])),
         replace(begun, window=replace(begun.window, next_node=99)),
         replace(begun, factors=begun.factors | {LandmarkPoints.name: torn}),
     ):

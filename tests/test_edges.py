@@ -102,6 +102,27 @@ def test_landmarks_that_share_the_odometrys_error_see_nothing_of_it(scale_of_poi
     assert np.nan_to_num(found.common_across_m) < 1e-6
 
 
+def test_a_vehicle_is_where_its_own_edges_say_whoever_else_is_in_sight() -> None:
+    """Its estimate without the others' edges is the same; joint, these move it a little, through the ego."""
+    world = drive(DriveConfig(frames=40, vehicles=4, landmarks=6, lane_points=0, traffic="convoy"), seed=3)
+    chosen = world.measurements[0].cv[0].vehicle
+    gaps_m = {}
+    for may_move in (False, True):
+        settings = GraphConfig(vehicles_move_ego=may_move), WeightsConfig()
+        crowd, alone = PoseGraph(*settings), PoseGraph(*settings)
+        for m in world.measurements:
+            own = replace(m, cv=tuple(e for e in m.cv if e.vehicle == chosen), vv=())
+            ends = [graph.optimise(one).vehicles for graph, one in ((crowd, m), (alone, own))]
+        (in_crowd,), (by_itself,) = ([v for v in vehicles if v.vehicle == chosen] for vehicles in ends)
+        T, other = in_crowd.T_world_vehicle, by_itself.T_world_vehicle
+        gaps_m[may_move] = math.hypot(T.x_m - other.x_m, T.y_m - other.y_m)
+        if not may_move:
+            assert in_crowd.cov == pytest.approx(by_itself.cov, rel=1e-9, abs=1e-12)
+            assert in_crowd.velocity_cov == pytest.approx(by_itself.velocity_cov, rel=1e-9, abs=1e-12)
+    assert gaps_m[False] < 1e-9
+    assert 1e-3 < gaps_m[True] < 1.0
+
+
 def test_vehicles_edges_leave_the_ego_where_it_is_unless_they_may_move_it() -> None:
     """Its pose and covariance are those without any vehicle; the vehicles' places follow their edges all the same."""
     world = drive(DriveConfig(frames=30, vehicles=3, landmarks=6, lane_points=0), seed=3)

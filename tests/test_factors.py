@@ -18,9 +18,9 @@ from birdslam.graph.factors.odometry import Odometry
 from birdslam.graph.factors.standard import standard_factors
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
-from birdslam.graph.state_layout import StateLayout
+from birdslam.graph.state_layout import OF_VEHICLE, StateLayout
 from birdslam.graph.weights import WeightsConfig
-from birdslam.graph.window import Window
+from birdslam.graph.window import EGO_PLACE, Window
 from birdslam.types import Estimate
 
 SETTINGS = GraphConfig(), WeightsConfig()
@@ -95,7 +95,7 @@ class LaneLine(Factor):
         lines = [record for record in frame.records if isinstance(record, Line)]
         if not lines:
             return None
-        J = np.zeros((2 * len(lines), len(window.P)))
+        J = np.zeros((2 * len(lines), window.layout.size))
         J[0::2, :2] = np.sin(T.yaw_rad), np.cos(T.yaw_rad)
         J[1::2, 2] = 1.0
         residual = [number for line in lines for number in (line.offset_m - T.y_m, line.heading_rad - T.yaw_rad)]
@@ -260,13 +260,76 @@ def test_unit_vectors_may_be_given_as_a_jacobian() -> None:
         def linearise(self, frame: GraphFrame, window: Window) -> Linearised | None:
             term = super().linearise(frame, window)
             if term is not None:
-                term.jacobian = np.eye(len(window.P))[term.jacobian]
+                term.jacobian = np.eye(window.layout.size)[term.jacobian]
             return term
 
     records = {e.frame_id: (fix_at(e, (0.1, 0.1), 0.1),) for e in run(graph_with(), {})}
     for a, b in zip(run(graph_with(Gnss()), records), run(graph_with(Dense()), records), strict=True):
         assert a.T_world_ego.between(b.T_world_ego).log() == pytest.approx(np.zeros(3), abs=1e-9)
         np.testing.assert_allclose(a.cov, b.cov, rtol=1e-6, atol=1e-12)
+
+
+# --- vehicles apart, and together ---
+
+
+class Gap(Factor):
+    """The ego keeps its distance to the first vehicle, which ties the two."""
+
+    name = "gap"
+    equation = "x"
+
+    def linearise(self, frame: GraphFrame, window: Window) -> Linearised | None:
+        if not len(window.velocity):
+            return None
+        J = np.zeros((1, window.layout.size))
+        J[0, [EGO_PLACE[0], window.layout.poses[0, 0]]] = 1.0
+        return Linearised([0.01], J, np.full((1, 1, 1), 0.1))
+
+
+class TyingGap(Gap):
+    ties_vehicles = True
+
+
+def test_vehicles_that_an_edge_ties_are_held_together() -> None:
+    """Else each vehicle has its own block of P, and one that ties them is refused rather than taken by half."""
+    apart, tied = graph_with(), graph_with(TyingGap())
+    run(apart, {})
+    estimates = run(tied, {})
+    assert apart.window is not None
+    assert tied.window is not None
+    assert apart.window.of_vehicles.shape == (3, OF_VEHICLE, OF_VEHICLE)
+    assert tied.window.of_vehicles.shape == (1, 3 * OF_VEHICLE, 3 * OF_VEHICLE)
+    assert np.linalg.eigvalsh(tied.window.P).min() > -1e-9
+    assert len(estimates[-1].vehicles) == 3
+    with pytest.raises(ValueError, match="ties_vehicles"):
+        run(graph_with(Gap()), {})
+
+
+def test_a_line_of_a_vehicle_is_the_same_edge_together_and_apart() -> None:
+    """Edges by each vehicle's own numbers, with Jacobians that are none of unit vectors."""
+
+    class Aside(Factor):
+        name = "aside"
+        equation = "y + yaw"
+        of_vehicles = True
+
+        def linearise(self, frame: GraphFrame, window: Window) -> Linearised | None:
+            rows = [*range(len(window.velocity))]
+            J = np.tile(np.eye(1, OF_VEHICLE, 1) + np.eye(1, OF_VEHICLE, 2), (len(rows), 1, 1))
+            return Linearised([0.05] * len(rows), J, np.full((len(rows), 1, 1), 0.2), vehicles=rows) if rows else None
+
+    class Together(Factor):
+        name = "nothing"
+        equation = ""
+        ties_vehicles = True
+
+    apart, together = graph_with(Aside()), graph_with(Aside(), Together())
+    for m in LOG:
+        of_one = replace(m, cv=m.cv[:1], vv=m.vv[:1])
+        (a,), (b,) = (graph.optimise(of_one).vehicles for graph in (apart, together))
+        assert a.cov == pytest.approx(b.cov, rel=1e-6, abs=1e-9)
+        assert a.velocity_mps == pytest.approx(b.velocity_mps, rel=1e-6, abs=1e-7)
+        assert a.T_world_vehicle.between(b.T_world_vehicle).log() == pytest.approx(np.zeros(3), abs=1e-7)
 
 
 # --- a loop between two poses of the window ---

@@ -12,7 +12,7 @@ from birdslam.bench.simulation.drive import Drive, DriveConfig, drive
 from birdslam.bench.tracking.benchmark import PAPER
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
-from birdslam.graph.edges import CvEdge
+from birdslam.graph.edges import CvEdges
 from birdslam.graph.factors.factor import Factor, GraphFrame, Linearised
 from birdslam.graph.factors.standard import standard_factors
 from birdslam.graph.factors.vehicle_landmarks import VehicleLandmarks
@@ -60,7 +60,7 @@ class Probe(Factor):
         self.at, self.world = list(window.at), window.world
 
 
-def added(log: list[Measurements]) -> list[tuple[Window, list[CvEdge], Floats]]:
+def added(log: list[Measurements]) -> list[tuple[Window, CvEdges, Floats]]:
     """What the edges of each frame add to the information about the state: the window, its CV edges, (n, n)."""
     probe, out = Probe("probe"), []
     without_vehicles_cp = replace(PAPER.weights, cp_vehicles=None)
@@ -90,8 +90,8 @@ def test_each_edge_adds_its_lambda_and_nothing_adds_more() -> None:
         )  # those that the world has, from their first sight
         summed += known
         expected[[0, 1], [0, 1]] = LAMBDA_CP * known  # of the ego's place in the world: not its yaw, no other pose
-        assert len(cv) == len(m.cv) == 3
-        far_to_near = sorted((-e.at.real, e.row) for e in cv)
+        assert len(cv.rows) == len(m.cv) == 3
+        far_to_near = sorted(zip(-cv.at.real, cv.rows, strict=True))
         weights = []
         for _, row in far_to_near:
             rows = window.layout.poses[row]
@@ -208,7 +208,7 @@ def test_cp_of_vehicles_adds_its_lambda_to_their_place_in_the_world() -> None:
         more = np.linalg.inv(after.after) - np.linalg.inv(before.after)
         expected = np.zeros_like(more)
         for row in graph.window.layout.poses if known else ():
-            at = before.at[graph.window.nodes + (row[0] - graph.window.layout.firsts[0]) // 6]
+            at = before.at[graph.window.nodes + (row[0] - graph.window.layout.poses[0, 0]) // 6]
             H = np.zeros((2, len(more)))
             H[:, [0, 1]] = H[:, row[:2]] = np.eye(2)
             H[:, 2] = -at.imag, at.real

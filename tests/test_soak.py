@@ -11,7 +11,7 @@ import psutil
 import pytest
 
 from birdslam.perf.robustness import soak
-from birdslam.perf.robustness.soak import Ages, Series, Systemd, ages, faults, sample, slope, table
+from birdslam.perf.robustness.soak import Ages, Series, Systemd, ages, drift, faults, sample, slope, table
 from tests.test_bus import until
 
 WELL: dict[str, Any] = {
@@ -46,6 +46,28 @@ def test_what_a_start_makes_once_is_not_carried_on(systemd: Systemd) -> None:
     (said,) = faults({"map": slow}, WELL, systemd)  # half a percent in ten minutes
     assert said.startswith("map would grow by 2")
     assert said.endswith("in 8 hours")
+
+
+def test_one_step_is_no_growth_and_many_are_one(systemd: Systemd) -> None:
+    one = series([210.9] * 164 + [211.9] * 64, [30] * 228)  # 1 MiB at once in 19 minutes: a table that doubles
+    assert list(faults({"supervisor": one}, WELL, systemd)) == []
+    gain, sigma = one.in_a_shift()
+    assert gain == pytest.approx(sigma, rel=0.05)
+    many = series([210.0 + 0.1 * (k // 6) for k in range(120)], [30] * 120)  # 2 MiB in ten minutes, by steps of .1
+    assert any("perceive would grow by" in said for said in faults({"perceive": many}, WELL, systemd))
+
+
+def test_the_sigma_of_a_drift_is_what_a_drift_scatters() -> None:
+    t_s, rng = np.arange(0.0, 3600.0, 5.0), np.random.default_rng(7)
+    found = []
+    for _ in range(300):
+        steps = rng.exponential(0.4, t_s.size) * (rng.random(t_s.size) < 0.05)  # what is held is kept
+        found.append(drift(t_s, 100.0 + np.cumsum(steps)))
+    gains, sigmas = np.transpose(found)
+    expected = 0.4 * 0.05 * 720
+    assert gains.mean() == pytest.approx(expected, rel=0.02)
+    assert np.sqrt(np.mean(sigmas**2)) == pytest.approx(gains.std(), rel=0.2)
+    assert np.isnan(drift([1.0], [2.0])).all()
 
 
 @pytest.mark.parametrize(

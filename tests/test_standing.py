@@ -9,10 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
-from birdslam.graph.standing import DECIDED, GIVEN_UP, STANDING_MPS, decide, judge, reported_velocity
+from birdslam.graph.standing import DECIDED, GIVEN_UP, STANDING_MPS, decide, judge, reported_velocities
 from birdslam.graph.vehicles import VehicleNode
 from birdslam.graph.weights import WeightsConfig
 from birdslam.types import EgoEdge, Measurements, Moves, VehicleEdge, VehicleEstimate
@@ -26,8 +27,14 @@ def node(standing_seen: float | None, **more: object) -> VehicleNode:
 
 
 def judged(vehicle: VehicleNode, v_mps: tuple[float, float], sigma_mps: float) -> VehicleNode:
-    judge(vehicle, v_mps, (sigma_mps**2, 0.0, 0.0, sigma_mps**2), BIRTH_DET, 7)
+    judge([vehicle], np.array([v_mps]), sigma_mps**2 * np.eye(2)[None], BIRTH_DET, 7)
     return vehicle
+
+
+def reported(vehicle: VehicleNode, v_mps: tuple[float, float], cov: Floats) -> tuple[Floats, Floats]:
+    """Velocity (2,) and covariance (2, 2)."""
+    (u,), (C,) = reported_velocities([vehicle], np.array([v_mps]), cov[None])
+    return u, C
 
 
 @given(probabilities)
@@ -45,8 +52,7 @@ def test_the_covariance_is_the_mixtures_about_what_is_told(
     moves: Moves, p: float, v: tuple[float, float], sigmas: tuple[float, float]
 ) -> None:
     """Its moments, from points that have the two parts' moments exactly."""
-    u, cov = reported_velocity(node(p, standing=p, moves=moves), v, (sigmas[0] ** 2, 0.0, 0.0, sigmas[1] ** 2))
-    C = np.reshape(cov, (2, 2))
+    u, C = reported(node(p, standing=p, moves=moves), v, np.diag(np.square(sigmas)))
     assert np.hypot(*u) <= np.hypot(*v) + 1e-9
     spread = math.sqrt(2.0) * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
     points = np.concatenate([STANDING_MPS * spread, v + spread * sigmas]) - u
@@ -59,9 +65,9 @@ def test_who_was_just_seen_is_not_decided_on_and_its_velocity_is_pulled_to_nil()
     assert new.moves is Moves.UNDECIDED
     assert new.standing is not None
     assert 0.2 < new.standing < 0.8
-    u, C = reported_velocity(new, (6.0, 0.0), (36.0, 0.0, 0.0, 36.0))
+    u, C = reported(new, (6.0, 0.0), 36.0 * np.eye(2))
     assert u[0] < 6.0 * (1.0 - new.standing) + 1e-9
-    assert u[0] - 2.0 * math.sqrt(C[0]) < 0.0  # nor is it told to drive for sure
+    assert u[0] - 2.0 * math.sqrt(C[0, 0]) < 0.0  # nor is it told to drive for sure
 
 
 def test_both_have_to_agree() -> None:
@@ -104,7 +110,9 @@ def test_who_is_not_seen_or_not_spoken_of_is_not_judged(vehicle: VehicleNode) ->
     judged(vehicle, (0.0, 0.0), 0.5)
     assert vehicle.moves is Moves.UNDECIDED
     assert vehicle.standing is None
-    assert reported_velocity(vehicle, (3.0, 1.0), (1.0, 0.0, 0.0, 1.0)) == ((3.0, 1.0), (1.0, 0.0, 0.0, 1.0))
+    u, C = reported(vehicle, (3.0, 1.0), np.eye(2))
+    assert u.tolist() == [3.0, 1.0]
+    assert C.tolist() == np.eye(2).tolist()
 
 
 def driven_past(

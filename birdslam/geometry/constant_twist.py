@@ -1,42 +1,42 @@
-"""Motion with a constant twist on the road plane, one body at a time.
+"""Motion with a constant twist on the road plane.
 
-A pose is its position x + iy and its heading e^(i yaw) as Python complex numbers, so that composing is multiplying. For
-a handful of bodies this is faster than numpy.
+A pose is its position x + iy and its heading e^(i yaw), so that composing is multiplying: complex numbers, or arrays of
+them for many bodies at once.
 """
 
 from __future__ import annotations
 
-import cmath
-import math
+import numpy as np
 
-_SMALL_RAD = 0.05  # below it the series is exact to the last digit
+from birdslam.geometry.arrays import Complexes, Floats
+
+_LEAST_RAD = 1e-20  # in the place of no turn, for which sin w / w is 1
 
 
 def advance(
-    heading: complex, velocity: complex, turn_radps: float, dt_s: float
-) -> tuple[complex, complex, complex, complex]:
-    """A pose with `heading` drives for `dt_s` with a constant twist: how far (m), and with which heading then.
+    heading: Complexes, velocity: Complexes, turn_radps: Floats, dt_s: Floats
+) -> tuple[Complexes, Complexes, Complexes, Complexes]:
+    """Poses with `heading` (N,) drive for `dt_s` (N,) with constant twists: how far (m), and with which heading then.
 
-    `velocity` (m/s) is in the body's own axes, the way in those in which the heading is given. Beside it how errors of
-    the velocity and of the turn move the end of the way: its partial derivatives by the complex velocity and by
-    `turn_radps`.
+    `velocity` (m/s) is in the bodies' own axes, the ways in those in which the headings are given. Beside them how
+    errors of the velocity and of the turn move the end of the way: its partial derivatives by the complex velocity and
+    by `turn_radps`.
     """
     w = turn_radps * dt_s
-    half = cmath.rect(1.0, 0.5 * w)
-    towards = heading * dt_s
-    by_velocity = towards * chord(w, half)
-    by_turn = towards * half * velocity * dt_s * complex(-w / 12.0, 0.5)
+    half = np.exp(0.5j * w)
+    towards = heading * dt_s * half
+    by_velocity = towards * _chord(w)
+    by_turn = towards * velocity * dt_s * (0.5j - w / 12.0)
     return by_velocity * velocity, heading * half * half, by_velocity, by_turn
 
 
-def rate(way: complex, yaw_rad: float, dt_s: float) -> tuple[complex, float]:
-    """The twist that takes `dt_s` to come to the pose (`way`, `yaw_rad`): velocity (m/s) and yaw rate."""
-    return way / (chord(yaw_rad, cmath.rect(1.0, 0.5 * yaw_rad)) * dt_s), yaw_rad / dt_s
+def rate(way: Complexes, yaw_rad: Floats, dt_s: Floats) -> tuple[Complexes, Floats]:
+    """The twists that take `dt_s` to come to the poses (`way`, `yaw_rad`): velocities (m/s) and yaw rates."""
+    return way / (np.exp(0.5j * yaw_rad) * _chord(yaw_rad) * dt_s), yaw_rad / dt_s
 
 
-def chord(w: float, half: complex) -> complex:
-    """(e^iw - 1) / iw, given `half` = e^(iw / 2)."""
-    w2 = w * w
-    if w2 < _SMALL_RAD * _SMALL_RAD:
-        return half * (1.0 - w2 * (1.0 / 24.0 - w2 / 1920.0))
-    return half * (math.sin(0.5 * w) / (0.5 * w))
+def _chord(w: Floats) -> Floats:
+    """|e^iw - 1| / w: how much shorter the way is than along its arc."""
+    half = np.abs(0.5 * w) + _LEAST_RAD
+    out: Floats = np.sin(half) / half
+    return out

@@ -19,7 +19,7 @@ from birdslam.graph.window import WindowState
 from birdslam.lanes.traffic import TrafficState
 from birdslam.types import FollowedPerson
 
-VERSION = 10
+VERSION = 11
 _MAGIC = b"BirdSLAM graph\n"
 _SUM_BYTES = 16
 _KINDS = {"<f8": np.float64, "<c16": np.complex128, "<i8": np.int64}

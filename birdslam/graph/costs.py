@@ -2,42 +2,40 @@
 
 Information matrices are given by their inverses, covariances. Poses are complex: a position x + iy and a heading
 e^(i yaw). A point's covariance [[m + a, b], [b, m - a]] is its mean m and its deviator d = a + ib: turning by an angle
-multiplies d by e^(2i angle), and the inverse is (m, -d) / (m^2 - |d|^2). Edges of vehicles are a dozen a frame, taken
-one by one in Python's own numbers; landmarks are hundreds, and arrays.
+multiplies d by e^(2i angle), and the inverse is (m, -d) / (m^2 - |d|^2). A frame's edges of a type are arrays.
 """
 
 from __future__ import annotations
 
-import cmath
-from collections.abc import Sequence
-
 import numpy as np
-from numpy.typing import NDArray
 
-from birdslam.geometry.arrays import Floats, Ints
+from birdslam.geometry.arrays import Complexes, Floats
 
-Complexes = NDArray[np.complex128]
-Rows = Ints
 Triple = tuple[float, float, float]
-Cov = tuple[float, ...]  # row-major, of (x_m, y_m, yaw_rad)
 
 
-def binary_residual(measured_at: complex, measured_heading: complex, at: complex, heading: complex) -> Triple:
-    """(x_m, y_m, yaw_rad) of a CV or VV edge, in the axes of the source node.
+def binary_residuals(measured_at: Complexes, measured_heading: Complexes, at: Complexes, heading: Complexes) -> Floats:
+    """(k, 3) the (x_m, y_m, yaw_rad) of CV or VV edges, in the axes of their source nodes.
 
-    The measurement T_S_D, and the pose of D in S that the window has, each as place and heading.
+    The measurements T_S_D, and the poses of D in S that the window has, each as place (k,) and heading (k,).
     """
+    out = np.empty((len(at), 3))
     gap = measured_at - at  # Eq. 2: its translation
-    return gap.real, gap.imag, cmath.phase(measured_heading * heading.conjugate())  # Eq. 2: its rotation
+    out[:, 0], out[:, 1] = gap.real, gap.imag
+    turn = measured_heading * heading.conj()
+    out[:, 2] = np.arctan2(turn.imag, turn.real)  # Eq. 2: its rotation
+    return out
 
 
-def rotated(cov: Cov, heading: complex) -> Cov:
-    """A covariance in axes that point to `heading`, in the axes that this heading is in."""
-    xx, xy, xt, _, yy, yt, _, _, tt = cov
-    mean = 0.5 * (xx + yy)
-    d = complex(0.5 * (xx - yy), xy) * heading * heading
-    t = complex(xt, yt) * heading
-    return mean + d.real, d.imag, t.real, d.imag, mean - d.real, t.imag, t.real, t.imag, tt
+def rotated(covs: Floats, heading: Complexes) -> Floats:
+    """(k, 3, 3) covariances in axes that point to `heading` (k,), in the axes that these headings are in: (k, 3, 3)."""
+    turn = np.zeros(covs.shape)
+    turn[:, 0, 0] = turn[:, 1, 1] = heading.real
+    turn[:, 1, 0] = heading.imag
+    turn[:, 0, 1] = -heading.imag
+    turn[:, 2, 2] = 1.0
+    out: Floats = turn @ covs @ turn.transpose(0, 2, 1)
+    return out
 
 
 def inflation(costs: Floats, gate: float) -> Floats:
@@ -48,35 +46,10 @@ def inflation(costs: Floats, gate: float) -> Floats:
     return np.maximum(1.0, costs / gate) ** 2  # Eq. 4, inverted
 
 
-def pose_cost(residual: Sequence[float], cov: Sequence[Sequence[float]]) -> float:
-    """The squared Mahalanobis distance of a residual (3,) with covariance (3, 3), by its Cholesky factors LDL'.
-
-    0 where the matrix is no covariance.
-    """
-    (xx, _, _), (yx, yy, _), (tx, ty, tt) = cov
-    x, y, t = residual
-    if xx <= 0.0:
-        return 0.0
-    to_y, to_t = yx / xx, tx / xx
-    yy -= to_y * yx
-    ty -= to_t * yx
-    if yy <= 0.0:
-        return 0.0
-    y_to_t = ty / yy
-    tt -= to_t * tx + y_to_t * ty
-    if tt <= 0.0:
-        return 0.0
-    y -= to_y * x
-    t -= to_t * x + y_to_t * y
-    return x * x / xx + y * y / yy + t * t / tt  # Eq. 5
-
-
-def edge_cost(residual: Sequence[float], cov: Sequence[Sequence[float]]) -> float:
-    """The same of an edge of any number of dimensions d: residual (d,), covariance (d, d)."""
-    try:
-        return float(np.dot(residual, np.linalg.solve(cov, residual)))  # Eq. 5
-    except np.linalg.LinAlgError:
-        return 0.0
+def pose_costs(residuals: Floats, weights: Floats) -> Floats:
+    """(k,) squared Mahalanobis distances of residuals (k, d, 1), by the inverses (k, d, d) of their covariances."""
+    out: Floats = (residuals.transpose(0, 2, 1) @ weights @ residuals)[:, 0, 0]  # Eq. 5
+    return out
 
 
 def point_costs(residuals: Complexes, means: Floats, deviators: Complexes) -> Floats:

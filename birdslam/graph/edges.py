@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from itertools import chain
 
 import numpy as np
 
+from birdslam.geometry.arrays import Complexes, Floats
 from birdslam.geometry.se2 import SE2
-from birdslam.graph.costs import Cov
 from birdslam.types import EgoEdge, Measurements, MotionEdge, VehicleEdge
 
 LARGEST_M = 1e5  # an edge that is longer, or less certain, is no measurement
@@ -22,24 +22,29 @@ class PoseEdges:
     cc: EgoEdge | None
     cv: list[VehicleEdge]
     vv: list[MotionEdge]
+    cv_numbers: Floats  # (k, 12) of each CV edge: x_m, y_m, yaw_rad and the covariance, row-major
+    vv_numbers: Floats  # (k, 12) the same of VV edges
 
 
-class CvEdge(NamedTuple):
-    """A CV edge of the newest frame to a vehicle that the window has."""
+@dataclass(slots=True)
+class CvEdges:
+    """CV edges of the newest frame to k vehicles that the window has, in ego."""
 
-    row: int  # of the vehicle in the window
-    at: complex  # the measured place, in ego
-    heading: complex
-    cov: Cov  # in ego
+    rows: list[int]  # of the vehicles in the window
+    at: Complexes  # (k,) the measured places
+    heading: Complexes  # (k,)
+    covs: Floats  # (k, 3, 3)
 
 
-class VvEdge(NamedTuple):
-    """A VV edge from the newest pose of a vehicle in the window to the newest frame."""
+@dataclass(slots=True)
+class VvEdges:
+    """VV edges from the newest poses of k vehicles in the window to the newest frame."""
 
-    row: int  # of the vehicle in the window
-    dt_s: float  # the interval that the edge spans
-    motion: SE2  # T_from_to
-    cov: Cov  # in the axes of the measured pose
+    rows: list[int]  # of the vehicles in the window
+    dt_s: Floats  # (k,) the intervals that the edges span
+    at: Complexes  # (k,) T_from_to
+    yaw_rad: Floats  # (k,)
+    covs: Floats  # (k, 3, 3) in the axes of the measured poses
 
 
 def pose_edges(m: Measurements) -> PoseEdges:
@@ -48,13 +53,21 @@ def pose_edges(m: Measurements) -> PoseEdges:
     What can't be a measurement is left out: a matrix that is no covariance, a length that is not of this world.
     """
     frame, cc = m.frame_id, m.cc
-    cv = {e.vehicle: e for e in m.cv if e.frame == frame}.values()
-    vv = {e.vehicle: e for e in m.vv if e.to_frame == frame}.values()
+    cv = [*{e.vehicle: e for e in m.cv if e.frame == frame}.values()]
+    vv = [*{e.vehicle: e for e in m.vv if e.to_frame == frame}.values()]
+    cv = [e for e in cv if _is_valid(e.T_ego_vehicle, e.cov)]
+    vv = [e for e in vv if _is_valid(e.T_from_to, e.cov)]
     return PoseEdges(
         cc if cc is not None and _is_valid(cc.T_from_to, cc.cov) else None,
-        [e for e in cv if _is_valid(e.T_ego_vehicle, e.cov)],
-        [e for e in vv if _is_valid(e.T_from_to, e.cov)],
+        cv,
+        vv,
+        _numbers([part for e in cv for T in (e.T_ego_vehicle,) for part in ((T.x_m, T.y_m, T.yaw_rad), e.cov)]),
+        _numbers([part for e in vv for T in (e.T_from_to,) for part in ((T.x_m, T.y_m, T.yaw_rad), e.cov)]),
     )
+
+
+def _numbers(parts: list[tuple[float, ...]]) -> Floats:
+    return np.fromiter(chain.from_iterable(parts), np.float64, 6 * len(parts)).reshape(-1, 12)
 
 
 def _is_valid(T: SE2, cov: tuple[float, ...]) -> bool:

@@ -12,12 +12,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Complexes, Floats
 from birdslam.geometry.constant_twist import advance
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.around.approach import approaches
 from birdslam.graph.costs import Triple
-from birdslam.graph.standing import judge, reported_velocity
+from birdslam.graph.standing import judge, reported_velocities
+from birdslam.graph.state_layout import EGO
 from birdslam.graph.vehicles import VehicleNode
 from birdslam.graph.window import Window
 from birdslam.types import Approach, VehicleEstimate
@@ -51,27 +52,26 @@ def vehicle_estimates(
     """
     if not vehicles:
         return ()
-    ahead_s = [max((t_ns - v.node_ns) * 1e-9, 0.0) for v in vehicles]
-    poses, velocities, covs = marginals_in_world(window, ahead_s, changes)
-    covs += _of_sizes(window.world, ego_mps, vehicles, poses, velocities)
-    motions: list[tuple[tuple[float, float], tuple[float, float, float, float]]] = []
-    for v, velocity, cov in zip(vehicles, velocities, covs.tolist(), strict=True):
-        velocity_cov = cov[3][3], cov[3][4], cov[4][3], cov[4][4]
-        if birth_det is not None:
-            judge(v, velocity, velocity_cov, birth_det, t_ns)
-            velocity, velocity_cov = reported_velocity(v, velocity, velocity_cov)
-        motions.append((velocity, velocity_cov))
-    near = _approaches(window, ego_mps, vehicles, poses, motions)
-    out = []
-    for v, pose, (velocity, velocity_cov), cov, approach in zip(
-        vehicles, poses, motions, covs.tolist(), near, strict=True
-    ):
-        reported = VehicleEstimate(
+    ahead_s = np.array([max((t_ns - v.node_ns) * 1e-9, 0.0) for v in vehicles])
+    sizes = np.array([v.size_bias_rel for v in vehicles])  # 1-sigma of each distance by its size, a fraction
+    at, heading, velocities, covs = marginals_in_world(window, ahead_s, changes)
+    covs += _of_sizes(window.world, ego_mps, sizes, at, heading, velocities)
+    moving, moving_covs = velocities.view(np.float64).reshape(-1, 2), covs[:, 3:, 3:]
+    if birth_det is not None:
+        judge(vehicles, moving, moving_covs, birth_det, t_ns)
+        moving, moving_covs = reported_velocities(vehicles, moving, moving_covs)
+    near = _approaches(window, ego_mps, sizes, at, moving, moving_covs)
+    numbers = np.empty((len(vehicles), 18))  # of each record, in a row
+    numbers[:, 0], numbers[:, 1], numbers[:, 2] = at.real, at.imag, np.arctan2(heading.imag, heading.real)
+    numbers[:, 3:5], numbers[:, 5:9] = moving, moving_covs.reshape(-1, 4)
+    numbers[:, 9:].reshape(-1, 3, 3)[...] = covs[:, :3, :3]
+    return tuple(
+        VehicleEstimate(
             vehicle=v.vehicle,
-            T_world_vehicle=pose,
-            cov=(*cov[0][:3], *cov[1][:3], *cov[2][:3]),
-            velocity_mps=velocity,
-            velocity_cov=velocity_cov,
+            T_world_vehicle=SE2(x_m, y_m, yaw_rad),
+            cov=(*cov,),
+            velocity_mps=(x_mps, y_mps),
+            velocity_cov=(xx, xy, yx, yy),
             age_ns=max(t_ns - v.seen_ns, 0),
             frames=v.frames,
             label=v.label,
@@ -84,83 +84,72 @@ def vehicle_estimates(
             sigma_height_m=v.sigma_height_m,
             approach=approach,
         )
-        out.append(reported)
-    return tuple(out)
+        for v, approach, (x_m, y_m, yaw_rad, x_mps, y_mps, xx, xy, yx, yy, *cov) in zip(
+            vehicles, near, numbers.tolist(), strict=True
+        )
+    )
 
 
 def _approaches(
-    window: Window,
-    ego_mps: complex,
-    vehicles: Sequence[VehicleNode],
-    poses: Sequence[SE2],
-    motions: Sequence[tuple[tuple[float, float], tuple[float, float, float, float]]],
+    window: Window, ego_mps: complex, sizes: Floats, at: Complexes, velocities: Floats, covs: Floats
 ) -> list[Approach]:
-    """Of each vehicle to the ego, in the ego's axes: without the ego's error in world, which both have."""
+    """Of each vehicle to the ego, in the ego's axes: without the ego's error in world, which both have.
+
+    `at` (M,), `velocities` (M, 2) and their `covs` (M, 2, 2) are in world; `sizes` (M,).
+    """
     back, origin = cmath.rect(1.0, -window.world.yaw_rad), complex(window.world.x_m, window.world.y_m)
-    numbers: list[complex] = []
-    for pose, ((x, y), (xx, xy, _, yy)), node in zip(poses, motions, vehicles, strict=True):
-        at = (complex(pose.x_m, pose.y_m) - origin) * back
-        velocity = complex(x, y) * back - ego_mps
-        turned = complex(0.5 * (xx - yy), xy) * back * back
-        by_size = node.size_bias_rel * at
-        numbers += (at, velocity, 0.5 * (xx + yy), turned, 0.5 * abs(by_size) ** 2, 0.5 * by_size * by_size)
-    p, v, u_mean, u_deviator, size_mean, size_deviator = np.array(numbers).reshape(-1, 6).T
-    xx, xy, yy = window.P.take(window.layout.places)
-    means = np.array([0.5 * (xx + yy) + size_mean.real, u_mean.real])
-    return approaches(p, v, means, np.array([0.5 * (xx - yy) + 1j * xy + size_deviator, u_deviator]))
+    p, v = (at - origin) * back, (velocities[:, 0] + 1j * velocities[:, 1]) * back - ego_mps
+    turn = np.array([[back.real, -back.imag], [back.imag, back.real]])
+    by_size = (sizes * p).view(np.float64).reshape(-1, 2)
+    both = np.zeros((len(p), 4, 4))
+    both[:, :2, :2] = window.each_vehicle[:, :2, :2] + by_size[:, :, None] * by_size[:, None]
+    both[:, 2:, 2:] = turn @ covs @ turn.T
+    return approaches(p, v, both)
 
 
 def _of_sizes(
-    world: SE2,
-    ego_mps: complex,
-    vehicles: Sequence[VehicleNode],
-    poses: Sequence[SE2],
-    velocities: Sequence[tuple[float, float]],
+    world: SE2, ego_mps: complex, sizes: Floats, at: Complexes, heading: Complexes, velocities: Complexes
 ) -> Floats:
-    """(M, 5, 5), as the covariances of `marginals_in_world`: what errors of the vehicles' sizes add; see the module."""
+    """(M, 5, 5), as the covariances of `marginals_in_world`: what errors of the vehicles' `sizes` (M,) add."""
     ego, velocity_mps = complex(world.x_m, world.y_m), ego_mps * cmath.rect(1.0, world.yaw_rad)
-    numbers: list[float] = []
-    for v, pose, (x_mps, y_mps) in zip(vehicles, poses, velocities, strict=True):
-        s = v.size_bias_rel
-        away = s * (complex(pose.x_m, pose.y_m) - ego) * cmath.rect(1.0, -pose.yaw_rad)  # in the vehicle's axes
-        numbers += (away.real, away.imag, 0.0, s * (x_mps - velocity_mps.real), s * (y_mps - velocity_mps.imag))
-    g = np.array(numbers).reshape(-1, 5, 1)
-    return g @ g.transpose(0, 2, 1)
+    g = np.zeros((len(at), 5))
+    away, closing = sizes * (at - ego) * heading.conj(), sizes * (velocities - velocity_mps)  # in the vehicle's axes
+    g[:, 0], g[:, 1], g[:, 3], g[:, 4] = away.real, away.imag, closing.real, closing.imag
+    return g[:, :, None] * g[:, None]
 
 
 def marginals_in_world(
-    window: Window, ahead_s: Sequence[float], changes: Triple
-) -> tuple[list[SE2], list[tuple[float, float]], Floats]:
-    """Vehicles in world, driven on by `ahead_s` (M,) past their newest pose: poses, velocities in m/s, and the
-    covariances (M, 5, 5) of both. `changes` (3,): twists' variances grow by so much a second.
+    window: Window, ahead_s: Floats, changes: Triple
+) -> tuple[Complexes, Complexes, Complexes, Floats]:
+    """Vehicles in world, driven on by `ahead_s` (M,) past their newest pose: places, headings and velocities (M,) in
+    m/s, and the covariances (M, 5, 5) of pose and velocity. `changes` (3,): twists' variances grow by so much a second.
     """
-    ego, origin = cmath.rect(1.0, window.world.yaw_rad), complex(window.world.x_m, window.world.y_m)
-    poses: list[SE2] = []
-    velocities: list[tuple[float, float]] = []
-    numbers: list[float] = []
-    means = zip(
-        window.at[window.nodes :], window.heading[window.nodes :], window.velocity, window.turn_radps, strict=True
-    )
-    for (at, heading, velocity, turn_radps), t in zip(means, ahead_s, strict=True):
-        way = g = d = 0j
-        if t:
-            way, heading, g, d = advance(heading, velocity, turn_radps, t)
-            at += way
-        back = heading.conjugate()  # to the vehicle's own axes
-        in_world, place = heading * ego, at * ego + origin
-        poses.append(SE2(place.real, place.imag, cmath.phase(in_world)))
-        velocity *= in_world
-        velocities.append((velocity.real, velocity.imag))
-        lever, turn, g, d = 1j * back * at, 1j * back * way, back * g, back * d
-        # An error of the yaw turns the velocity, one of the twist adds to it
-        x, y, c, s = -velocity.imag, velocity.real, in_world.real, in_world.imag
-        numbers += (0.0, 1.0, back.real, -back.imag, back.imag, lever.real, lever.imag, turn.real, turn.imag)
-        numbers += (g.real, -g.imag, g.imag, d.real, d.imag, t, c, -s, s, x, y, t * x, t * y)
-    J = np.fromiter(numbers, np.float64, len(numbers)).reshape(len(poses), -1).take(_JACOBIAN, axis=1)
-    C = window.P.take(window.layout.own)
-    if any(ahead_s):
+    ego, origin, n = cmath.rect(1.0, window.world.yaw_rad), complex(window.world.x_m, window.world.y_m), window.nodes
+    at, heading, velocities = window.at[n:], window.heading[n:], window.velocity
+    late = ahead_s.any()
+    numbers = np.zeros((22, len(at)))  # a row for each that _JACOBIAN counts
+    if late:
+        way, heading, g, d = advance(heading, velocities, window.turn_radps, ahead_s)
+        at = at + way
+        back = heading.conj()
+        turn, g, d = 1j * back * way, back * g, back * d
+        numbers[7:9] = turn.real, turn.imag
+        numbers[9:15] = g.real, -g.imag, g.imag, d.real, d.imag, ahead_s
+    back = heading.conj()  # to the vehicles' own axes
+    in_world, lever = heading * ego, 1j * back * at
+    velocities = velocities * in_world
+    # An error of the yaw turns the velocity, one of the twist adds to it
+    x, y, c, s = -velocities.imag, velocities.real, in_world.real, in_world.imag
+    numbers[1:7] = np.ones(len(at)), back.real, -back.imag, back.imag, lever.real, lever.imag
+    numbers[15:20] = c, -s, s, x, y
+    numbers[20:] = ahead_s * x, ahead_s * y
+    J = numbers.T.take(_JACOBIAN, axis=1)
+    C = np.empty((len(at), 9, 9))  # of the ego in world and of each vehicle's own numbers
+    C[:, :3, :3], C[:, 3:, :3], C[:, 3:, 3:] = window.ego_cov, window.with_egos[:, :, EGO], window.each_vehicle
+    C[:, :3, 3:] = C[:, 3:, :3].transpose(0, 2, 1)
+    if late:
         C.reshape(-1, 81)[:, 60::10] += np.outer(ahead_s, changes)
     covs: Floats = J @ C @ J.transpose(0, 2, 1)
     variances = covs.reshape(-1, 25)[:, ::6]
     np.maximum(variances, 0.0, out=variances)  # where all is known, rounding has either sign
-    return poses, velocities, covs
+    return at * ego + origin, in_world, velocities, covs

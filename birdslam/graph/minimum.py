@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from birdslam.geometry.arrays import Floats
-from birdslam.graph.costs import edge_cost, inflation, pose_cost
+from birdslam.graph.costs import inflation, pose_costs
 from birdslam.graph.factors.factor import Linearised
-from birdslam.graph.state_layout import diagonal_blocks
+from birdslam.graph.state_layout import EGO, OF_VEHICLE, StateLayout, diagonal_blocks
 from birdslam.graph.window import Window
 
 _LEAST = 1e-8  # 0.1 mm, 0.1 mrad: edges more exact than that would cost the covariances their digits
@@ -20,60 +20,158 @@ _LEFT_OUT = 1e12  # so uncertain an edge says nothing
 
 @functools.cache
 def solver() -> tuple[Any, Any]:
-    """LAPACK and BLAS, which take 22 MB and a second to load: who solves asks for them at the start, the others
-    never."""
+    """LAPACK and BLAS for edges of all at once. They take 22 MB and a second to load: who needs them asks for them at
+    the start, the others never."""
     from scipy.linalg import blas, lapack
 
     return lapack, blas
 
 
-def minimise(window: Window, terms: Sequence[Linearised], hold: slice | None = None) -> None:
+def minimise(window: Window, of_vehicles: Sequence[Linearised], terms: Sequence[Linearised], hold_ego: bool) -> None:
     """The minimum of Eq. 8 over the edges of the newest frame, all at once, linearised at the prediction.
 
-    Notes in each of `terms` which of its edges are outliers. The numbers `hold` of the state keep their mean and
-    covariance, and their part in all others' uncertainty: they are considered, not estimated (Schmidt 1966). Where the
-    numbers leave all bounds, the window is not finite afterwards.
+    The edges `of_vehicles` leave the ego's poses where they are; `hold_ego` is of the newest pose alone and of the
+    other `terms`. What is held keeps its mean and covariance, and its part in all others' uncertainty: it is
+    considered, not estimated (Schmidt 1966). Notes in each term which of its edges are outliers. Where the numbers
+    leave all bounds, the window is not finite afterwards.
     """
+    try:
+        if window.together:
+            _all_at_once(window, of_vehicles, window.layout.ego_poses)
+            _all_at_once(window, terms, EGO if hold_ego else None)
+            return
+        moved = np.zeros((len(window.velocity), OF_VEHICLE))
+        for term in of_vehicles:
+            _each_vehicle(window, term, moved)
+        _egos(window, terms, EGO if hold_ego else None)
+    except np.linalg.LinAlgError:  # no numbers of a road: something here is no covariance any more
+        window.of_egos[:] = np.nan
+
+
+def _each_vehicle(window: Window, term: Linearised, moved: Floats) -> None:
+    """Edges that are each of one vehicle, which nothing ties to another: k systems of d equations, not one of k d.
+
+    `moved` (M, 6) is by how much the terms before have moved each vehicle since its edges were linearised.
+    """
+    if term.vehicles is None:
+        raise ValueError("edges that leave the ego where it is are of single vehicles: `Linearised.vehicles`")
+    rows: list[int] | slice = term.vehicles
+    if rows == [*range(len(window.velocity))]:
+        rows = slice(None)  # without a copy
+    J, (k, d, _) = term.jacobian, term.covs.shape
+    V, C, residual = window.of_vehicles[rows], window.with_egos[rows], np.reshape(term.residual, (k, d, 1))
+    if isinstance(J, list):
+        HV, HC = V.take(J, axis=1), C.take(J, axis=1)
+        S = HV.take(J, axis=2)
+        residual = residual - moved[rows].take(J, axis=1)[:, :, None]
+    else:
+        HV, HC = J @ V, J @ C
+        residual = residual - J @ moved[rows][:, :, None]
+        S = HV @ J.transpose(0, 2, 1)
+    S += term.covs
+    S.reshape(k, d * d)[:, :: d + 1] += _LEAST
+    weights = _inverses(S)
+    if term.gate is not None and _inflate(S, term, term.gate, pose_costs(residual, weights)):
+        weights = _inverses(S)
+    gain = HV.transpose(0, 2, 1) @ weights  # P H' S^-1
+    window.of_vehicles[rows] -= gain @ HV
+    window.with_egos[rows] -= gain @ HC
+    dx = (gain @ residual)[:, :, 0]  # Eq. 8: where the sum of the window's own cost and F is least
+    window.shift_vehicles(rows, dx)
+    moved[rows] += dx
+
+
+def _egos(window: Window, terms: Sequence[Linearised], hold: slice | None) -> None:
+    """Edges of the ego's poses. What is relative to them goes with them, by what they have in common."""
     if not terms:
         return
-    residual: list[float] = []
-    for term in terms:
-        residual += term.residual  # Eq. 8: F is the sum over all factors
-    HP, S = _projected(window.P, terms)
+    E, B = window.layout.ego_poses.stop, len(window.of_vehicles)
+    H = _jacobian(terms, window.layout)
+    C = window.with_egos.reshape(-1, E).T
+    if isinstance(H, list):
+        HP, HC = window.of_egos.take(H, axis=0), C.take(H, axis=0)
+        S = HP.take(H, axis=1)
+    else:
+        if H[:, E:].any():
+            raise ValueError("edges that tie the ego to vehicles need `Factor.ties_vehicles`")
+        H = H[:, :E]
+        HP, HC = H @ window.of_egos, H @ C
+        S = HP @ H.T
+    _add_noise(S, terms)
+    known = np.concatenate([HP, HC, _residual(terms)[:, None]], axis=1)
+    W = np.linalg.solve(np.linalg.cholesky(S), known)  # P H' S^-1 H P = W'W
+    of_egos, of_vehicles, whitened_residual = W[:, :E], W[:, E:-1], W[:, -1]
+    dx, held = whitened_residual @ of_egos, None if hold is None else window.of_egos[hold, hold].copy()
+    window.of_egos -= of_egos.T @ of_egos
+    if hold is not None:
+        dx[hold] = 0.0
+        window.of_egos[hold, hold] = held
+    window.shift_egos(dx)  # Eq. 8, as above
+    if B and of_vehicles.size:
+        window.with_egos -= (of_vehicles.T @ of_egos).reshape(window.with_egos.shape)
+        blocks = of_vehicles.T.reshape(B, -1, len(W))
+        window.of_vehicles -= blocks @ blocks.transpose(0, 2, 1)
+        window.shift_vehicles(slice(None), (whitened_residual @ of_vehicles).reshape(-1, OF_VEHICLE))
+
+
+def _all_at_once(window: Window, terms: Sequence[Linearised], hold: slice | None) -> None:
+    """Edges of any part of the state, over P as one matrix."""
+    if not terms:
+        return
+    P, H = window.P, _jacobian(terms, window.layout)
+    if isinstance(H, list):  # all rows are unit vectors: rows and columns of P
+        HP = P.take(H, axis=0)
+        S = HP.take(H, axis=1)
+    else:
+        HP = H @ P
+        S = HP @ H.T
     _add_noise(S, terms)
     lapack, blas = solver()
     L, failed = lapack.dpotrf(S.T, lower=1, overwrite_a=1)
-    if failed:  # no numbers of a road: nothing here is a covariance any more, which the caller sees
-        window.P[:] = np.nan
-        return
+    if failed:
+        raise np.linalg.LinAlgError
     W = blas.dtrsm(1.0, L, HP.T, side=1, lower=1, trans_a=1, overwrite_b=1).T  # P H' S^-1 H P = W'W
-    whitened = blas.dtrsv(L, np.array(residual), lower=1, overwrite_x=1)
-    dx = (whitened @ W).tolist()  # Eq. 8: where the sum of the window's own cost and F is least
-    held = None if hold is None else window.P[hold, hold].copy()
-    window.P -= W.T @ W
+    dx = blas.dtrsv(L, _residual(terms), lower=1, overwrite_x=1) @ W  # Eq. 8, as above
+    held = None if hold is None else P[hold, hold].copy()
+    P -= W.T @ W
     if hold is not None:
-        dx[hold] = [0.0] * (hold.stop - hold.start)
-        window.P[hold, hold] = held
+        dx[hold] = 0.0
+        P[hold, hold] = held
+    window.set_P(P)
     window.shift(dx)
 
 
-def _projected(P: Floats, terms: Sequence[Linearised]) -> tuple[Floats, Floats]:
-    """H P and H P H' (what the window does not know of the residuals), H the Jacobians of all terms, one below another.
+def _residual(terms: Sequence[Linearised]) -> Floats:
+    """Eq. 8: F is the sum over all factors."""
+    return np.concatenate([np.reshape(term.residual, -1) for term in terms])
 
-    Where all their rows are unit vectors, these are rows and columns of P.
-    """
-    index: list[int] = []
+
+def _jacobian(terms: Sequence[Linearised], layout: StateLayout) -> list[int] | Floats:
+    """Of all terms, one below another, by the state (m, n); or, where all rows are unit vectors, by their numbers."""
+    units = [_units(term.jacobian, term, layout) for term in terms if isinstance(term.jacobian, list)]
+    if len(units) == len(terms):
+        return [i for of_term in units for i in of_term]
+    unit, rows = np.eye(layout.size), []
     for term in terms:
-        if not isinstance(term.jacobian, list):
-            break
-        index += term.jacobian
-    else:
-        HP = P.take(index, axis=0)
-        return HP, HP.take(index, axis=1)
-    unit = np.eye(len(P))
-    H = np.concatenate([unit[term.jacobian] if isinstance(term.jacobian, list) else term.jacobian for term in terms])
-    HP = H @ P
-    return HP, HP @ H.T
+        J = term.jacobian
+        if isinstance(J, list):
+            rows.append(unit[_units(J, term, layout)])
+        elif term.vehicles is None:
+            rows.append(np.pad(J, ((0, 0), (0, layout.size - J.shape[1]))))
+        else:
+            each = np.zeros((*J.shape[:2], layout.size))
+            for k, row in enumerate(term.vehicles):
+                each[k][:, layout.of_vehicles[row]] = J[k]
+            rows.append(each.reshape(-1, layout.size))
+    return np.concatenate(rows)
+
+
+def _units(numbers: list[int], term: Linearised, layout: StateLayout) -> list[int]:
+    """The numbers of the state that those of a term are."""
+    if term.vehicles is None:
+        return numbers
+    of_each: list[int] = layout.of_vehicles[term.vehicles][:, numbers].ravel().tolist()
+    return of_each
 
 
 def _add_noise(S: Floats, terms: Sequence[Linearised]) -> None:
@@ -83,23 +181,32 @@ def _add_noise(S: Floats, terms: Sequence[Linearised]) -> None:
         blocks = diagonal_blocks(S, first, term.covs.shape)
         blocks += term.covs
         placed.append((term, blocks))
-        first += len(term.residual)
+        first += len(blocks) * blocks.shape[1]
     S.reshape(-1)[:: len(S) + 1] += _LEAST
     for term, blocks in placed:
         if term.gate is not None:
-            term.outliers = _inflate(blocks, term, term.gate)
+            residual = np.reshape(term.residual, (*blocks.shape[:2], 1))
+            _inflate(blocks, term, term.gate, pose_costs(residual, _inverses(blocks)))
 
 
-def _inflate(blocks: Floats, term: Linearised, gate: float) -> list[int]:
-    """Adds to the covariances (k, d, d) of residuals what edges past `gate` are less sure; which are outliers."""
-    d, e = term.covs.shape[1], term.residual
-    cost = pose_cost if d == 3 else edge_cost
-    distances = [cost(e[d * k : d * k + d], cov) for k, cov in enumerate(blocks.tolist())]
-    outliers: list[int] = []
-    if max(distances) > gate:
-        outliers = [k for k, distance in enumerate(distances) if distance > 4.0 * gate]
-        more = inflation(np.array(distances), gate) - 1.0
-        more[outliers] = 0.0
-        blocks += more[:, None, None] * term.covs
-        blocks[outliers] += _LEFT_OUT * np.eye(d)
-    return outliers
+def _inverses(covs: Floats) -> Floats:
+    """Of (k, d, d). Raises np.linalg.LinAlgError where one of them is no covariance."""
+    np.linalg.cholesky(covs)
+    return np.asarray(np.linalg.inv(covs), np.float64)
+
+
+def _inflate(blocks: Floats, term: Linearised, gate: float, distances: Floats) -> bool:
+    """Adds to the covariances (k, d, d) of residuals what edges past `gate` are less sure, and notes the outliers.
+
+    Whether any is past it.
+    """
+    term.outliers = []
+    if distances.max() <= gate:
+        return False
+    outliers = np.flatnonzero(distances > 4.0 * gate).tolist()
+    more = inflation(distances, gate) - 1.0
+    more[outliers] = 0.0
+    blocks += more[:, None, None] * term.covs
+    blocks[outliers] += _LEFT_OUT * np.eye(blocks.shape[1])
+    term.outliers = outliers
+    return True

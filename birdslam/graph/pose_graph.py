@@ -31,8 +31,8 @@ from birdslam.graph.graph_config import GraphConfig, check_together
 from birdslam.graph.marginals import vehicle_estimates
 from birdslam.graph.minimum import minimise, solver
 from birdslam.graph.pending_map import PendingMap
-from birdslam.graph.state_layout import EGO
-from birdslam.graph.vehicles import SHORTEST_S, VehicleNodes, cv_edge
+from birdslam.graph.state_layout import POSE
+from birdslam.graph.vehicles import SHORTEST_S, VehicleNodes, cv_edges
 from birdslam.graph.weights import WeightsConfig, weighted
 from birdslam.graph.window import Window
 from birdslam.lanes.occupancy import with_users
@@ -82,10 +82,12 @@ class PoseGraph:
         # Whether a vehicle stands is judged by its velocity's covariance: Eq. 6 alone has none that was measured
         self._birth_det = float(self._birth[0, 0] * self._birth[1, 1]) if config.constant_velocity else None
         self._camera_sigma_rel = 0.0  # of the last frame that said it
+        self._together = config.vehicles_move_ego or any(factor.ties_vehicles for factor in self.factors)
+        if self._together:
+            solver()
         self.window: Window | None = None  # None before the first frame
         self._people: tuple[FollowedPerson, ...] = ()  # in the newest frame's ego
         self._traffic = Traffic()
-        solver()
 
     def optimise(self, measurements: Measurements, records: Sequence[object] = ()) -> Estimate:
         """One frame's edges in; the newest frame's poses, velocities and covariances out.
@@ -128,12 +130,12 @@ class PoseGraph:
         window, out = self.window, {}
         if window is None:
             return {}
+        covs = window.each_vehicle[:, POSE, POSE]
         for row, v in enumerate(self._vehicles.nodes):
             if v.seen_ns == self._t_ns:
-                k, states = window.nodes + row, window.layout.poses[row]
-                at, yaw_rad = window.at[k], cmath.phase(window.heading[k])
+                at, yaw_rad = complex(window.at[window.nodes + row]), cmath.phase(window.heading[window.nodes + row])
                 by_size = v.size_bias_rel * np.array([at.real, at.imag, 0.0])  # see marginals.py
-                cov = window.P[np.ix_(states, states)] + np.outer(by_size, by_size)
+                cov = covs[row] + np.outer(by_size, by_size)
                 out[v.vehicle] = SE2(at.real, at.imag, yaw_rad), cov
         return out
 
@@ -179,7 +181,7 @@ class PoseGraph:
         if begun is None:
             return graph
         try:
-            graph.window = Window.from_state(begun.window)
+            graph.window = Window.from_state(begun.window, graph._together)
             for factor in graph.factors:
                 if factor.state_type is not None:
                     factor.resume(unpacked(begun.factors.get(factor.name, b""), factor.state_type))
@@ -199,7 +201,7 @@ class PoseGraph:
     def _begin(self, m: Measurements, reset: bool) -> Window:
         config = self.config
         self.epoch += int(reset)
-        self.window = Window(config.ego_nodes, m.frame_id)
+        self.window = Window(config.ego_nodes, m.frame_id, self._together)
         self._vehicles = VehicleNodes(config.forget_s, config.max_vehicles, config.detection_contradictions)
         for factor in self.factors:
             factor.begin()
@@ -235,18 +237,16 @@ class PoseGraph:
 
     def _minimise(self, frame: GraphFrame, window: Window) -> None:
         """Eq. 8 over this frame's edges."""
-        hold = EGO if frame.zero_velocity else None
         terms: dict[str, Linearised] = {}
         alone: list[Linearised] = []  # what leaves the ego where it is
         joint: list[Linearised] = []
         for factor in self._linearising:
             term = factor.linearise(frame, window)
-            if term is not None and math.isfinite(sum(term.residual)):
+            if term is not None and math.isfinite(np.sum(term.residual)):
                 terms[factor.name] = term
                 leaves_ego = factor.of_vehicles and not self.config.vehicles_move_ego
                 (alone if leaves_ego else joint).append(term)
-        minimise(window, alone, window.layout.ego_poses)
-        minimise(window, joint, hold)
+        minimise(window, alone, joint, frame.zero_velocity)
         self.outliers = {name: term.outliers for name, term in terms.items()}
 
     def _update_vehicles(self, frame: GraphFrame, window: Window) -> None:
@@ -256,19 +256,19 @@ class PoseGraph:
         rows, begun = self._vehicles.update(cv, known, outliers, m.t_source_ns)
         if rows is not None:
             window.select(rows)
-        for k in begun:
-            row = self._vehicles.begin(cv[k].vehicle, m.frame_id, m.t_source_ns)
-            seen = cv_edge(row, cv[k])
-            window.place_vehicle(row, seen.at, seen.heading, seen.cov, self._birth_cov(seen.cov[-1]))
+        if begun:
+            begins = [self._vehicles.begin(cv[k].vehicle, m.frame_id, m.t_source_ns) for k in begun]
+            seen = cv_edges(begins, frame.edges.cv_numbers[begun])
+            window.place_vehicles(seen, self._birth_covs(seen.covs[:, 2, 2]))
 
-    def _birth_cov(self, yaw_variance: float) -> Floats:
-        """(3, 3) of the twist of a vehicle seen for the first time, at rest for all that is known.
+    def _birth_covs(self, yaw_variances: Floats) -> Floats:
+        """(k, 3, 3) of the twists of vehicles seen for the first time, at rest for all that is known.
 
         A yaw that is off turns the velocity: the twist is in axes that are off by it, so its variances grow by that.
         """
-        out = self._birth.copy()
-        out[0, 0] += yaw_variance * self._birth[1, 1]
-        out[1, 1] += yaw_variance * self._birth[0, 0]
+        out = np.tile(self._birth, (len(yaw_variances), 1, 1))
+        out[:, 0, 0] += yaw_variances * self._birth[1, 1]
+        out[:, 1, 1] += yaw_variances * self._birth[0, 0]
         return out
 
     # --- the newest frame's estimates ---

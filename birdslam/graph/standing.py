@@ -8,13 +8,14 @@ the equations and the reasons.
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
+from typing import overload
 
+import numpy as np
+
+from birdslam.geometry.arrays import Floats
 from birdslam.graph.vehicles import VehicleNode
 from birdslam.types import Moves
-
-Pair = tuple[float, float]
-Quad = tuple[float, float, float, float]
 
 PRIOR = 1.0 / 3.0  # of the vehicles stand when first seen, as parallax.py has it
 # Of those first seen more than 15 m aside, on another road or on none. By the labels of KITTI tracking 0000 to 0020: 48
@@ -29,26 +30,33 @@ _LEAST_DET = 1e-12  # of a velocity's covariance, (m/s)^4
 _SHARE = {Moves.STANDING: 1.0, Moves.DRIVING: 0.0}
 
 
-def judge(v: VehicleNode, velocity: Pair, cov: Quad, birth_det: float, t_ns: int) -> None:
-    """Renews `standing` and `moves` of a vehicle, if this frame, at source time `t_ns`, has an edge of it.
+def judge(vehicles: Sequence[VehicleNode], velocities: Floats, covs: Floats, birth_det: float, t_ns: int) -> None:
+    """Renews `standing` and `moves` of the vehicles of which this frame, at source time `t_ns`, has edges.
 
-    `velocity` (x, y) in m/s with `cov`, row-major, is the graph's; `birth_det` is the determinant of such a covariance
-    at birth.
+    `velocities` (M, 2) in m/s with `covs` (M, 2, 2) are the graph's; `birth_det` is the determinant of such a
+    covariance at birth.
     """
-    if v.seen_ns != t_ns or v.standing_seen is None:
+    rows = [row for row, v in enumerate(vehicles) if v.seen_ns == t_ns and v.standing_seen is not None]
+    if not rows:
         return
-    (x, y), (xx, xy, _, yy) = velocity, cov
-    det = max(xx * yy - xy * xy, _LEAST_DET)
+    x, y = velocities[rows].T
+    xx, xy, yy = covs[rows, 0, 0], covs[rows, 0, 1], covs[rows, 1, 1]
+    det = np.maximum(xx * yy - xy * xy, _LEAST_DET)
     z2 = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / det
-    by_velocity = _clipped(_logit(PRIOR) + 0.5 * (math.log(birth_det / det) - z2))
-    beside = _logit(PRIOR_BESIDE) - _logit(PRIOR) if v.beside else 0.0  # both have the prior of those on its road
-    standing = _probability((by_velocity + _clipped(_logit(v.standing_seen))) / 2.0 + beside)
-    if not v.in_path:
-        v.standing, v.moves = standing, decide(v.moves, standing)
-    elif standing <= 1.0 - DECIDED:  # no size and no tilt let what stands come nearer so slowly
-        v.standing, v.moves = standing, Moves.DRIVING
-    elif v.moves is not Moves.DRIVING and _probability(by_velocity) <= 1.0 - DECIDED:
-        v.standing, v.moves = None, Moves.UNDECIDED
+    by_velocity = _clipped(_logit(PRIOR) + 0.5 * (np.log(birth_det / det) - z2))
+    seen = np.array([vehicles[row].standing_seen for row in rows], np.float64)
+    # Both have the prior of those on its road
+    beside = np.array([vehicles[row].beside for row in rows]) * (_logit(PRIOR_BESIDE) - _logit(PRIOR))
+    pooled = _probability((by_velocity + _clipped(_logit(seen))) / 2.0 + beside)
+    alone = _probability(by_velocity)
+    for row, standing, by_velocity_alone in zip(rows, pooled.tolist(), alone.tolist(), strict=True):
+        v = vehicles[row]
+        if not v.in_path:
+            v.standing, v.moves = standing, decide(v.moves, standing)
+        elif standing <= 1.0 - DECIDED:  # no size and no tilt let what stands come nearer so slowly
+            v.standing, v.moves = standing, Moves.DRIVING
+        elif v.moves is not Moves.DRIVING and by_velocity_alone <= 1.0 - DECIDED:
+            v.standing, v.moves = None, Moves.UNDECIDED
 
 
 def decide(before: Moves, standing: float) -> Moves:
@@ -61,33 +69,37 @@ def decide(before: Moves, standing: float) -> Moves:
     return Moves.UNDECIDED if given_up else before
 
 
-def reported_velocity(v: VehicleNode, velocity: Pair, cov: Quad) -> tuple[Pair, Quad]:
-    """A vehicle's velocity u in m/s and its covariance, row-major, from the graph's, which is of a vehicle that moves.
+def reported_velocities(vehicles: Sequence[VehicleNode], velocities: Floats, covs: Floats) -> tuple[Floats, Floats]:
+    """Velocities u (M, 2) in m/s and their covariances (M, 2, 2), from the graph's, which are of vehicles that move.
 
     x = 0 with the probability p of standing, else N(v, P); u = (1 - w) v, and the covariance is
     (1 - p) P + ((1 - p) w^2 + p (1 - w)^2) v v' + p sigma^2 I; w is 1 when standing, 0 when driving, else p.
     """
-    (x, y), (xx, xy, yx, yy) = velocity, cov
-    p = v.standing or 0.0
-    w = _SHARE.get(v.moves, p)
-    drives, spread, stands = 1.0 - p, (1.0 - p) * w * w + p * (1.0 - w) ** 2, p * STANDING_MPS**2
-    reported = (
-        drives * xx + spread * x * x + stands,
-        drives * xy + spread * x * y,
-        drives * yx + spread * x * y,
-        drives * yy + spread * y * y + stands,
-    )
-    return ((1.0 - w) * x, (1.0 - w) * y), reported
+    stands = [v.standing or 0.0 for v in vehicles]
+    p = np.array(stands)
+    w = np.array([_SHARE.get(v.moves, of) for v, of in zip(vehicles, stands, strict=True)])
+    spread = (1.0 - p) * w * w + p * (1.0 - w) ** 2
+    reported = (1.0 - p)[:, None, None] * covs
+    reported += (spread[:, None] * velocities)[:, :, None] * velocities[:, None]
+    reported[:, 0, 0] += p * STANDING_MPS**2
+    reported[:, 1, 1] += p * STANDING_MPS**2
+    return (1.0 - w)[:, None] * velocities, reported
 
 
-def _clipped(log_odds: float) -> float:
+def _clipped(log_odds: Floats) -> Floats:
     most = _logit(SUREST)
-    return min(max(log_odds, -most), most)
+    return np.minimum(np.maximum(log_odds, -most), most)
 
 
-def _probability(log_odds: float) -> float:
-    return 1.0 / (1.0 + math.exp(-log_odds))
+def _probability(log_odds: Floats) -> Floats:
+    out: Floats = 1.0 / (1.0 + np.exp(-log_odds))
+    return out
 
 
-def _logit(probability: float) -> float:
-    return math.log(max(probability, 1e-12) / max(1.0 - probability, 1e-12))
+@overload
+def _logit(probability: float) -> float: ...
+@overload
+def _logit(probability: Floats) -> Floats: ...
+def _logit(probability: float | Floats) -> float | Floats:
+    out: float | Floats = np.log(np.maximum(probability, 1e-12) / np.maximum(1.0 - probability, 1e-12))
+    return out

@@ -12,6 +12,8 @@ import numpy as np
 from birdslam.geometry.arrays import Floats
 
 EGO = slice(0, 3)
+OF_VEHICLE = 6  # numbers of a vehicle
+POSE, TWIST = slice(0, 3), slice(3, 6)  # of its own numbers
 
 
 class StateLayout:
@@ -19,35 +21,24 @@ class StateLayout:
 
     def __init__(self, nodes: int, vehicles: int) -> None:
         first = 3 + 3 * nodes  # of the vehicles
-        self.size = first + 6 * vehicles
+        self.size = first + OF_VEHICLE * vehicles
         self.ego_poses = slice(0, first)  # the newest and the nodes
-        self.vehicles = slice(first, self.size)
-        self.firsts = range(first, self.size, 6)  # rows of the vehicles: three of the pose, three of the twist
-        self.poses_firsts = (*range(3, first, 3), *self.firsts)  # of all poses but the newest ego's
-        of_vehicles = first + np.arange(6 * vehicles, dtype=np.int64).reshape(vehicles, 6)
-        self.poses, self.twists = of_vehicles[:, :3], of_vehicles[:, 3:]  # (M, 3) each
+        of_vehicles = first + np.arange(OF_VEHICLE * vehicles, dtype=np.int64).reshape(vehicles, OF_VEHICLE)
         self.of_vehicles = of_vehicles  # (M, 6)
-        # Of all poses but the newest ego's, nodes and then vehicles: the rows of their places, and (n, 3) how they move
-        # when the ego does that they are relative to, but for the lever of its turn
-        moved = np.concatenate([3 + np.arange(3 * nodes, dtype=np.int64).reshape(nodes, 3), self.poses])
-        self.x_rows, self.y_rows = moved[:, 0], moved[:, 1]
-        self.against = np.zeros((self.size, 3))
-        self.against[EGO] = np.eye(3)
-        for axis in range(3):
-            self.against[moved[:, axis], axis] = -1.0
+        self.poses, self.twists = of_vehicles[:, POSE], of_vehicles[:, TWIST]  # (M, 3) each
+        # How poses that are relative to the newest ego move when it does, but for the lever of its turn: (first, 3) of
+        # the ego poses, its own first, and (M, 6, 3) of the vehicles
+        self.egos_against = -np.tile(np.eye(3), (1 + nodes, 1))
+        self.egos_against[EGO] = np.eye(3)
+        self.vehicles_against = np.zeros((vehicles, OF_VEHICLE, 3))
+        self.vehicles_against[:, POSE] = -np.eye(3)
+        self.vehicles_stay = np.tile(np.eye(OF_VEHICLE), (vehicles, 1, 1))  # (M, 6, 6) of those that do not drive
         # When the newest ego pose moves: where each entry of the Jacobian of the ego poses, its own adjoint and the
         # nodes' turn, stands in (0, 1, cos, sin, -sin, and the lever of the turn, y and -x)
         self.ego_moves = np.zeros((first, first), dtype=np.int64)
         for i in range(0, first, 3):
             self.ego_moves[i : i + 3, i : i + 3] = (2, 4, 0), (3, 2, 0), (0, 0, 1)
         self.ego_moves[:2, 2] = 5, 6
-        own = np.empty((vehicles, 9), dtype=np.int64)
-        own[:, :3] = np.arange(3)
-        own[:, 3:] = of_vehicles
-        # (M, 9, 9) of the numbers of P in a row: the ego's and each vehicle's own part
-        self.own = own[:, :, None] * self.size + own[:, None, :]
-        # (3, M) of them: xx, xy and yy of each vehicle's place
-        self.places = np.array([self.own[:, 3, 3], self.own[:, 3, 4], self.own[:, 4, 4]])
 
     @staticmethod
     @functools.lru_cache(maxsize=64)
@@ -59,11 +50,6 @@ class StateLayout:
     def node(k: int) -> slice:
         """The rows of an ego node."""
         return slice(3 + 3 * k, 6 + 3 * k)
-
-
-def diagonal(P: Floats) -> Floats:
-    """(n,) view of the diagonal of `P` (n, n), which is C-contiguous; numpy's own is read-only."""
-    return P.reshape(-1)[:: len(P) + 1]
 
 
 def diagonal_blocks(A: Floats, first: int, shape: tuple[int, ...]) -> Floats:

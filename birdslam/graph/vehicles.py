@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-import cmath
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
+from birdslam.geometry.arrays import Floats
 from birdslam.graph.costs import rotated
-from birdslam.graph.edges import CvEdge, PoseEdges, VvEdge
+from birdslam.graph.edges import CvEdges, PoseEdges, VvEdges
 from birdslam.types import Moves, VehicleEdge
 
 PATH_HALF_WIDTH_M = 1.75  # half a lane, as in vehicles/state/parallax.py
@@ -46,16 +49,20 @@ class Associations:
     """The edges of a frame to vehicles of the window, and for how long each vehicle drives on."""
 
     known: list[int]  # which of the frame's CV edges `cv` has
-    cv: list[CvEdge]
-    vv: list[VvEdge]
-    dt_s: list[float]  # (M,) since each vehicle's newest pose; 0: it gets no pose in this frame
+    cv: CvEdges
+    vv: VvEdges
+    dt_s: Floats  # (M,) since each vehicle's newest pose; 0: it gets no pose in this frame
 
 
-def cv_edge(row: int, edge: VehicleEdge) -> CvEdge:
-    """The edge to the vehicle in this row of the window, all in ego."""
-    T = edge.T_ego_vehicle
-    heading = cmath.rect(1.0, T.yaw_rad)
-    return CvEdge(row, complex(T.x_m, T.y_m), heading, rotated(edge.cov, heading))
+def cv_edges(rows: list[int], numbers: Floats) -> CvEdges:
+    """The edges to the vehicles in these rows of the window, all in ego, from their `numbers` (k, 12)."""
+    heading = np.exp(1j * numbers[:, 2])
+    covs = rotated(numbers[:, 3:].reshape(-1, 3, 3), heading)
+    return CvEdges(rows, numbers[:, 0] + 1j * numbers[:, 1], heading, covs)
+
+
+NO_CV = CvEdges([], np.zeros(0, np.complex128), np.zeros(0, np.complex128), np.zeros((0, 3, 3)))
+NO_VV = VvEdges([], np.zeros(0), np.zeros(0, np.complex128), np.zeros(0), np.zeros((0, 3, 3)))
 
 
 class VehicleNodes:
@@ -82,22 +89,28 @@ class VehicleNodes:
         rows = [self._row.get(e.vehicle, -1) for e in edges.cv]
         known = [k for k, row in enumerate(rows) if row >= 0]
         linked = []
-        for e in edges.vv:
+        for k, e in enumerate(edges.vv):
             row = self._row.get(e.vehicle)
             if row is not None and self.nodes[row].node_frame == e.from_frame:
-                linked.append((row, e))
+                linked.append((row, k))
         reached = {row for row, _ in linked}
         if constant_velocity:
             reached.update([rows[k] for k in known])
         else:
             known = [k for k in known if rows[k] in reached]
-        dt_s = [0.0] * len(self.nodes)
+        dt_s = np.zeros(len(self.nodes))
         for row in reached:
             v = self.nodes[row]
             dt_s[row] = max((t_ns - v.node_ns) * 1e-9, SHORTEST_S)
             v.node_frame, v.node_ns = frame, t_ns
-        cv = [cv_edge(rows[k], edges.cv[k]) for k in known]
-        return Associations(known, cv, [VvEdge(row, dt_s[row], e.T_from_to, e.cov) for row, e in linked], dt_s)
+        cv, vv = NO_CV, NO_VV
+        if known:
+            cv = cv_edges([rows[k] for k in known], _some(edges.cv_numbers, known))
+        if linked:
+            by_vv, of_vv = [row for row, _ in linked], _some(edges.vv_numbers, [k for _, k in linked])
+            at, covs = of_vv[:, 0] + 1j * of_vv[:, 1], of_vv[:, 3:].reshape(-1, 3, 3)
+            vv = VvEdges(by_vv, dt_s[by_vv], at, of_vv[:, 2], covs)
+        return Associations(known, cv, vv, dt_s)
 
     def row(self, vehicle: int) -> int:
         """Of a vehicle in the window; -1: it is not there."""
@@ -155,3 +168,7 @@ class VehicleNodes:
         v = self.nodes[row]
         v.node_frame, v.node_ns, v.agreed, v.contradicted = frame, t_ns, 1, 0
         return row
+
+
+def _some(numbers: Floats, rows: Sequence[int]) -> Floats:
+    return numbers if len(rows) == len(numbers) else numbers[rows]

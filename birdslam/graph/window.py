@@ -3,8 +3,7 @@
 It has the newest ego pose in the world, a few ego poses before it, each vehicle's newest pose and its twist. Poses that
 leave it are marginalised: in covariance form their rows are dropped, which is exact. All poses but the first are
 *relative to the newest ego*, and so are their errors, in its axes; docs/method.md ("The window") has the state, its
-charts and the reasons. Positions are complex numbers x + iy in metres and headings unit complex numbers e^(i yaw);
-P is an array and takes few calls of numpy, the mean, a dozen poses, is Python's own numbers.
+charts and the reasons. Positions are complex numbers x + iy in metres and headings unit complex numbers e^(i yaw).
 """
 
 from __future__ import annotations
@@ -12,15 +11,17 @@ from __future__ import annotations
 import cmath
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Complexes, Floats
 from birdslam.geometry.constant_twist import advance
 from birdslam.geometry.se2 import SE2
-from birdslam.graph.costs import Complexes, Cov, Rows
-from birdslam.graph.state_layout import EGO, StateLayout, diagonal
+from birdslam.graph.edges import CvEdges
+from birdslam.graph.state_layout import EGO, OF_VEHICLE, POSE, TWIST, StateLayout
 
 KEY_NODE = 0  # the ego node that landmarks are tied to; it is renewed once in every round of the nodes
 KEY_PLACE = [3 * KEY_NODE + 3, 3 * KEY_NODE + 4]  # the rows of its place
@@ -38,46 +39,55 @@ class WindowState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     heading: Complexes
     velocity: Complexes
     turn_radps: Floats
-    P: Floats
-
-
-_MEANS = {"at": np.complex128, "heading": np.complex128, "velocity": np.complex128, "turn_radps": np.float64}
+    of_egos: Floats
+    with_egos: Floats
+    of_vehicles: Floats
 
 
 class Window:
-    """The joint Gaussian of one epoch, which begins at `frame`. `nodes` ego poses are kept beside the newest."""
+    """The joint Gaussian of one epoch, which begins at `frame`. `nodes` ego poses are kept beside the newest.
 
-    def __init__(self, nodes: int, frame: int) -> None:
+    The covariance P is kept in the three parts that a frame works on: of the ego's poses, of vehicles with these, and
+    of vehicles. `together`: edges tie vehicles, and the last is one block. Else each vehicle has its own, and what two
+    of them have in common is not kept: nothing reads it. docs/method.md ("Vehicles and the ego") says what that is.
+    """
+
+    def __init__(self, nodes: int, frame: int, together: bool = False) -> None:
         self.nodes = nodes
         self.frame = frame
         self.node_frames: list[int | None] = [None] * nodes
         self.next_node = 0  # where the newest ego pose goes when the ego moves on
         self.world = SE2()  # T_world_ego
         # Poses in ego, of the ego nodes and then the vehicles; twists of the vehicles
-        self.at = [0j] * nodes
-        self.heading = [1.0 + 0j] * nodes
-        self.velocity: list[complex] = []  # in the vehicle's own frame, m/s
-        self.turn_radps: list[float] = []
+        self.at = np.zeros(nodes, np.complex128)
+        self.heading = np.ones(nodes, np.complex128)
+        self.velocity = np.zeros(0, np.complex128)  # in the vehicle's own frame, m/s
+        self.turn_radps = np.zeros(0)
         self.layout = StateLayout.of(nodes, 0)
-        self.P = np.zeros((self.layout.size, self.layout.size))
+        self.together = together
+        self.of_egos = np.zeros((self.layout.size, self.layout.size))  # (E, E)
+        self.with_egos = np.zeros((0, OF_VEHICLE, self.layout.size))  # (M, 6, E)
+        # (B, 6k, 6k): one block of k = M vehicles together, or B = M blocks of one
+        self.of_vehicles = np.zeros((1, 0, 0) if together else (0, OF_VEHICLE, OF_VEHICLE))
 
     def state(self) -> WindowState:
-        """For `from_state`; P is the window's own."""
-        fields = {name: getattr(self, name) for name in WindowState.__struct_fields__}
-        return WindowState(**fields | {name: np.array(fields[name], kind) for name, kind in _MEANS.items()})
+        """For `from_state`; its arrays are the window's own."""
+        return WindowState(**{name: getattr(self, name) for name in WindowState.__struct_fields__})
 
     @staticmethod
-    def from_state(state: WindowState) -> Window:
+    def from_state(state: WindowState, together: bool) -> Window:
         """The window that had this state. Raises ValueError where its arrays do not belong together."""
         nodes, M = len(state.node_frames), len(state.velocity)
-        layout = StateLayout.of(nodes, M)
-        sizes = len(state.at), len(state.heading), len(state.turn_radps), state.P.shape
-        if sizes != (nodes + M, nodes + M, M, (layout.size, layout.size)) or not 0 <= state.next_node < nodes:
-            raise ValueError(f"a window of {nodes} nodes and {M} vehicles with arrays of {sizes}")
-        window = Window(nodes, state.frame)
+        layout, window = StateLayout.of(nodes, M), Window(nodes, state.frame, together)
+        E, n = layout.ego_poses.stop, OF_VEHICLE * M
+        sizes = len(state.at), len(state.heading), len(state.turn_radps)
+        shapes = state.of_egos.shape, state.with_egos.shape, state.of_vehicles.shape
+        blocks = (1, n, n) if together else (M, OF_VEHICLE, OF_VEHICLE)
+        fit = sizes == (nodes + M, nodes + M, M) and shapes == ((E, E), (M, OF_VEHICLE, E), blocks)
+        if not fit or not 0 <= state.next_node < nodes:
+            raise ValueError(f"a window of {nodes} nodes and {M} vehicles with arrays of {sizes}, {shapes}")
         for name in WindowState.__struct_fields__:
-            value = getattr(state, name)
-            setattr(window, name, value.tolist() if name in _MEANS else value)
+            setattr(window, name, getattr(state, name))
         window.layout = layout
         return window
 
@@ -86,12 +96,48 @@ class Window:
     @property
     def ego_cov(self) -> Floats:
         """(3, 3) of the newest ego pose, a view."""
-        return self.P[EGO, EGO]
+        return self.of_egos[EGO, EGO]
+
+    @property
+    def each_vehicle(self) -> Floats:
+        """(M, 6, 6) of the vehicles' own numbers."""
+        if not self.together:
+            return self.of_vehicles
+        M = len(self.velocity)
+        return np.einsum("isit->ist", self.of_vehicles.reshape(M, OF_VEHICLE, M, OF_VEHICLE))
+
+    @property
+    def _variances(self) -> Floats:
+        """(M, 6) of the vehicles' own numbers, a view."""
+        B, n, _ = self.of_vehicles.shape
+        return self.of_vehicles.reshape(B, n * n)[:, :: n + 1].reshape(-1, OF_VEHICLE)
+
+    @property
+    def P(self) -> Floats:
+        """(n, n) a copy of all as one matrix; without `together` vehicles have nothing in common in it."""
+        n = self.layout.ego_poses.stop
+        P = np.zeros((self.layout.size, self.layout.size))
+        P[:n, :n] = self.of_egos
+        P[n:, :n] = self.with_egos.reshape(-1, n)
+        P[:n, n:] = P[n:, :n].T
+        if self.together:
+            P[n:, n:] = self.of_vehicles[0]
+        else:
+            for first, block in zip(range(n, len(P), OF_VEHICLE), self.of_vehicles, strict=True):
+                P[first : first + OF_VEHICLE, first : first + OF_VEHICLE] = block
+        return P
+
+    def set_P(self, P: Floats) -> None:
+        """All of it, of vehicles that are together."""
+        n = self.layout.ego_poses.stop
+        self.of_egos = P[:n, :n].copy()
+        self.with_egos = P[n:, :n].copy().reshape(-1, OF_VEHICLE, n)
+        self.of_vehicles = P[None, n:, n:].copy()
 
     @property
     def is_finite(self) -> bool:
         """False: numbers that no road has, and the window is of no more use."""
-        return math.isfinite(sum(diagonal(self.P).tolist()))
+        return math.isfinite(self.of_egos.trace() + self._variances.sum())
 
     @property
     def is_keyframe(self) -> bool:
@@ -101,7 +147,7 @@ class Window:
     def key_node(self) -> tuple[complex, complex, Floats]:
         """The key node's place and heading in ego, and the covariance (2, 2) of its place."""
         rows = StateLayout.node(KEY_NODE)
-        return self.at[KEY_NODE], self.heading[KEY_NODE], self.P[rows, rows][:2, :2]
+        return complex(self.at[KEY_NODE]), complex(self.heading[KEY_NODE]), self.of_egos[rows, rows][:2, :2]
 
     def has_pose(self, frame: int) -> bool:
         """Whether a CC edge can start at `frame`: the newest, or a node that the newest will not take the place of."""
@@ -115,7 +161,7 @@ class Window:
         cov: Floats,
         from_frame: int,
         to_frame: int,
-        dt_s: Sequence[float],
+        dt_s: Floats,
         twist_growth: Sequence[float],
     ) -> SE2:
         """The ego goes by `motion` with `cov` (3, 3) since the known frame `from_frame`: the CC edge of Eq. 2.
@@ -130,13 +176,12 @@ class Window:
         self.world = self.world @ T_ego_next  # Eq. 2, of a CC edge with the residual zero
         back = cmath.rect(1.0, -T_ego_next.yaw_rad)
         F = self._move_poses(T_ego_next, back, dt_s)
-        if any(twist_growth):
-            of_vehicles = diagonal(self.P)[self.layout.vehicles].reshape(-1, 6)
-            of_vehicles[:, 3:] += np.array(dt_s)[:, None] * twist_growth
+        if any(twist_growth) and len(dt_s):
+            self._variances[:, TWIST] += np.outer(dt_s, twist_growth)
         if node == 0:  # now and then, so that rounding can't add up
-            self.P += self.P.T.copy()
-            self.P *= 0.5
-            self.heading = [heading / abs(heading) for heading in self.heading]
+            self.of_egos = 0.5 * (self.of_egos + self.of_egos.T)
+            self.of_vehicles = 0.5 * (self.of_vehicles + self.of_vehicles.transpose(0, 2, 1))
+            self.heading /= np.abs(self.heading)
         self._move_errors(T_ego_next, back, F)
         self._add_motion_noise(cov, None if base == node else base)
         self.frame, self.next_node = to_frame, (node + 1) % self.nodes
@@ -147,59 +192,74 @@ class Window:
         node = self.next_node
         rows = StateLayout.node(node)
         self.at[node], self.heading[node] = 0j, 1.0 + 0j  # relative to the newest ego pose, which it still is itself
-        self.P[rows] = self.P[:, rows] = 0.0  # and so without error
+        self.of_egos[rows] = self.of_egos[:, rows] = 0.0  # and so without error
+        self.with_egos[:, :, rows] = 0.0
         self.node_frames[node] = self.frame
         return node
 
-    def _move_poses(self, T_ego_next: SE2, back: complex, dt_s: Sequence[float]) -> Floats:
+    def _move_poses(self, T_ego_next: SE2, back: complex, dt_s: Floats) -> Floats:
         """All poses, relative to the next ego pose, whose axes are turned by `back`; vehicles drive on.
 
-        Returns (M, 3, 6) how the errors of a vehicle's pose and twist move its next pose.
+        Returns (M, 6, 6) how the errors of a vehicle's pose and twist move.
         """
-        step, n = complex(T_ego_next.x_m, T_ego_next.y_m), self.nodes
-        at = [(before - step) * back for before in self.at]
-        heading = [before * back for before in self.heading]
-        c, s = back.real, back.imag
-        rows: list[float] = []
-        for k, (velocity, turn_radps, passed_s) in enumerate(zip(self.velocity, self.turn_radps, dt_s, strict=True), n):
-            way, heading[k], g, d = advance(heading[k], velocity, turn_radps, passed_s)
-            at[k] += way
-            rows += (c, -s, -way.imag, g.real, -g.imag, d.real)
-            rows += (s, c, way.real, g.imag, g.real, d.imag)
-            rows += (0.0, 0.0, 1.0, 0.0, 0.0, passed_s)
-        self.at, self.heading = at, heading
-        return np.fromiter(rows, np.float64, len(rows)).reshape(-1, 3, 6)
+        self.at = (self.at - complex(T_ego_next.x_m, T_ego_next.y_m)) * back
+        self.heading = self.heading * back
+        F = self.layout.vehicles_stay.copy()
+        if not len(F):
+            return F
+        n = self.nodes
+        way, self.heading[n:], g, d = advance(self.heading[n:], self.velocity, self.turn_radps, dt_s)
+        self.at[n:] += way
+        place = np.empty((len(F), OF_VEHICLE), np.complex128)  # x + iy of the next place by each number
+        place[:, :2] = back, 1j * back
+        place[:, 2], place[:, 3], place[:, 5] = 1j * way, g, d
+        place[:, 4] = 1j * g
+        F[:, 0], F[:, 1], F[:, 2, 5] = place.real, place.imag, dt_s
+        return F
 
     def _move_errors(self, T_ego_next: SE2, back: complex, F: Floats) -> None:
         """P of the moved poses: J P J', where J is block-diagonal."""
-        egos, vehicles, size = self.layout.ego_poses, self.layout.vehicles, self.layout.size
         T, c, s = T_ego_next.inverse(), back.real, back.imag
         J = np.array((0.0, 1.0, c, s, -s, T.y_m, -T.x_m)).take(self.layout.ego_moves)
-        P = self.P
-        for _ in range(2):  # J P, and then J (J P)' = J P J'
-            out = np.empty((size, size))
-            np.matmul(J, P[egos], out[egos])
-            of_vehicles, moved = P[vehicles].reshape(-1, 6, size), out[vehicles].reshape(-1, 6, size)
-            np.matmul(F, of_vehicles, moved[:, :3])
-            moved[:, 3:] = of_vehicles[:, 3:]
-            P = out.T
-        self.P = out
+        self.of_egos = J @ self.of_egos @ J.T
+        if not len(F):
+            return
+        E, (B, n, _) = len(J), self.of_vehicles.shape
+        self.with_egos = ((F @ self.with_egos).reshape(-1, E) @ J.T).reshape(-1, OF_VEHICLE, E)
+        F = F.reshape(B, -1, OF_VEHICLE, OF_VEHICLE)
+        for _ in range(2):  # F V, and then F (F V)' = F V F'
+            moved = F @ self.of_vehicles.reshape(B, -1, OF_VEHICLE, n)
+            self.of_vehicles = moved.reshape(B, n, n).transpose(0, 2, 1)
+        self.of_vehicles = np.ascontiguousarray(self.of_vehicles)
 
     def _add_motion_noise(self, cov: Floats, base: int | None) -> None:
         """The noise of the ego's motion `cov` (3, 3) moves all that is relative to the ego.
 
         So does, where the motion did not start at the newest pose but at the node `base`, the error of that node.
         """
-        P, layout, at = self.P, self.layout, np.array(self.at)
-        G = layout.against.copy()
-        G[layout.x_rows, 2] = at.imag
-        G[layout.y_rows, 2] = -at.real
+        layout, n, (B, size, _) = self.layout, self.nodes, self.of_vehicles.shape
+        G, G_vehicles = layout.egos_against.copy(), layout.vehicles_against.copy()
+        G[3::3, 2], G[4::3, 2] = self.at[:n].imag, -self.at[:n].real
+        G_vehicles[:, 0, 2], G_vehicles[:, 1, 2] = self.at[n:].imag, -self.at[n:].real
+        moved = [(G, G_vehicles, cov)]
         if base is not None:
             there = StateLayout.node(base)
-            G_base = G @ np.linalg.inv(-G[there])
-            P = P + G_base @ P[there] + (G_base @ P[there]).T + G_base @ P[there, there] @ G_base.T
-        P += G @ cov @ G.T
-        self.P = P
+            of_node = np.linalg.inv(-G[there])
+            G_base, G_base_vehicles = G @ of_node, G_vehicles @ of_node
+            moved.append((G_base, G_base_vehicles, self.of_egos[there, there].copy()))
+            in_common, with_node = self.with_egos[:, :, there], self.of_egos[there].copy()
+            more = G_base_vehicles.reshape(B, size, 3) @ in_common.reshape(B, size, 3).transpose(0, 2, 1)
+            self.of_vehicles += more + more.transpose(0, 2, 1)
+            self.with_egos = self.with_egos + G_base_vehicles @ with_node + in_common @ G_base.T
+            more = G_base @ with_node
+            self.of_egos += more + more.T
+        for of_egos, of_vehicles, C in moved:
+            self.of_egos += of_egos @ C @ of_egos.T
+            if len(of_vehicles):
+                noise = of_vehicles @ C
+                self.with_egos += (noise.reshape(-1, 3) @ of_egos.T).reshape(self.with_egos.shape)
+                blocks = of_vehicles.reshape(B, size, 3)
+                self.of_vehicles += noise.reshape(B, size, 3) @ blocks.transpose(0, 2, 1)
 
     def drift(self, along: complex, variance: float, across_variance: float) -> None:
         """The ego, and with it all that is relative to it, may have come this much further in the world than its edge
@@ -209,71 +269,92 @@ class Window:
         in sight nothing changes.
         """
         c, s = along.real, along.imag
-        self.P[:2, :2] += variance * np.outer((c, s), (c, s)) + across_variance * np.outer((-s, c), (-s, c))
+        self.of_egos[:2, :2] += variance * np.outer((c, s), (c, s)) + across_variance * np.outer((-s, c), (-s, c))
 
     def turn_drift(self, variance: float) -> None:
         """The ego, and with it all that is relative to it, may have turned this much more in the world (rad^2)."""
-        self.P[2, 2] += variance
+        self.of_egos[2, 2] += variance
 
     # --- corrections ---
 
-    def shift(self, dx: Sequence[float]) -> None:
-        """Moves the mean by `dx` (n,)."""
-        self.world = self.world @ SE2(*dx[:3])
-        at, heading, velocity, turn_radps = self.at, self.heading, self.velocity, self.turn_radps
-        for k, i in enumerate(self.layout.poses_firsts):
-            at[k] += complex(dx[i], dx[i + 1])
-            heading[k] *= cmath.rect(1.0, dx[i + 2])
-        for row, i in enumerate(self.layout.firsts):
-            velocity[row] += complex(dx[i + 3], dx[i + 4])
-            turn_radps[row] += dx[i + 5]
+    def shift_egos(self, dx: Floats) -> None:
+        """Moves the means of the ego's poses by `dx` (E,)."""
+        self.world = self.world @ SE2(*dx[:3].tolist())
+        n = self.nodes
+        self.at[:n] += dx[3::3] + 1j * dx[4::3]
+        self.heading[:n] *= np.exp(1j * dx[5::3])
+
+    def shift_vehicles(self, rows: Sequence[int] | slice, dx: Floats) -> None:
+        """Moves the means of vehicles `rows` (k,), each once, by `dx` (k, 6)."""
+        self.at[self.nodes :][rows] += dx[:, 0] + 1j * dx[:, 1]
+        self.heading[self.nodes :][rows] *= np.exp(1j * dx[:, 2])
+        self.velocity[rows] += dx[:, 3] + 1j * dx[:, 4]
+        self.turn_radps[rows] += dx[:, 5]
+
+    def shift(self, dx: Floats) -> None:
+        """Moves all means by `dx` (n,)."""
+        n = self.layout.ego_poses.stop
+        self.shift_egos(dx[:n])
+        self.shift_vehicles(slice(None), dx[n:].reshape(-1, OF_VEHICLE))
 
     def flip_headings(self, rows: Sequence[int]) -> None:
         """Vehicles `rows` (k,) have their front where their back was, and move as before: front and back look alike."""
-        sign = np.ones(len(self.P))
-        sign[self.layout.twists[rows, :2].ravel()] = -1.0
-        self.P *= sign[:, None] * sign
-        for row in rows:
-            self.heading[self.nodes + row] *= -1.0
-            self.velocity[row] *= -1.0
+        sign = np.ones((len(self.velocity), OF_VEHICLE))
+        sign[rows, TWIST.start : TWIST.start + 2] = -1.0
+        self.with_egos *= sign[:, :, None]
+        sign = sign.reshape(self.of_vehicles.shape[:2])
+        self.of_vehicles *= sign[:, :, None] * sign[:, None]
+        self.heading[self.nodes :][rows] *= -1.0
+        self.velocity[rows] *= -1.0
 
     # --- vehicles come and go ---
 
-    def place_vehicle(self, row: int, at: complex, heading: complex, cov: Cov, twist_cov: Floats) -> None:
-        """The vehicle `row` begins anew in ego, with `cov` in the ego's axes, at rest give or take, independent of all
-        else."""
-        self.at[self.nodes + row], self.heading[self.nodes + row] = at, heading
-        self._renew(self.layout.poses[[row]], np.reshape(cov, (3, 3)))
-        self.set_twists([row], [(0j, 0.0)], twist_cov)
+    def place_vehicles(self, seen: CvEdges, twist_covs: Floats) -> None:
+        """Vehicles begin anew where they are seen, at rest give or take, independent of all else."""
+        self.at[self.nodes :][seen.rows], self.heading[self.nodes :][seen.rows] = seen.at, seen.heading
+        self._renew(seen.rows, POSE, seen.covs)
+        self.set_twists(seen.rows, np.zeros(len(seen.rows)), np.zeros(len(seen.rows)), twist_covs)
 
-    def set_twists(self, rows: Sequence[int], twists: Sequence[tuple[complex, float]], covs: Floats) -> None:
+    def set_twists(self, rows: Sequence[int], velocity: Complexes | Floats, turn_radps: Floats, covs: Floats) -> None:
         """Vehicles `rows` (k,) get new twists with `covs` (k, 3, 3), independent of all else; their poses stay."""
-        for row, (velocity, turn_radps) in zip(rows, twists, strict=True):
-            self.velocity[row], self.turn_radps[row] = velocity, turn_radps
-        self._renew(self.layout.twists[rows], covs)
+        self.velocity[rows], self.turn_radps[rows] = velocity, turn_radps
+        self._renew(rows, TWIST, covs)
 
-    def _renew(self, numbers: Rows, covs: Floats) -> None:
-        """Each three numbers (k, 3) of the state get their covariance (k, 3, 3), and no correlation with others."""
-        P, all_of_them = self.P, numbers.reshape(-1)
-        P[all_of_them] = 0.0
-        P[:, all_of_them] = 0.0
-        P[numbers[:, :, None], numbers[:, None]] = covs
+    def _renew(self, rows: Sequence[int], numbers: slice, covs: Floats) -> None:
+        """These three numbers of each vehicle get their covariance (k, 3, 3), and no correlation with others."""
+        self.with_egos[rows, numbers] = 0.0
+        B, size, _ = self.of_vehicles.shape
+        V = self.of_vehicles.reshape(B, size // OF_VEHICLE, OF_VEHICLE, size // OF_VEHICLE, OF_VEHICLE)
+        block, within = (0, rows) if self.together else (rows, 0)
+        V[block, within, numbers] = 0.0
+        V[block, :, :, within, numbers] = 0.0
+        V[block, within, numbers, within, numbers] = covs
 
     def select(self, rows: Sequence[int]) -> None:
         """Keeps the vehicles `rows` in that order; -1 makes room for a new one, to be placed next."""
-        n, before, self.layout = self.nodes, self.layout, StateLayout.of(self.nodes, len(rows))
+        n, M = self.nodes, len(rows)
         kept, old = [k for k, row in enumerate(rows) if row >= 0], [row for row in rows if row >= 0]
-        egos = np.arange(before.ego_poses.stop)
-        source = np.concatenate([egos, before.of_vehicles[old].ravel()])
-        target = np.concatenate([egos, self.layout.of_vehicles[kept].ravel()])
-        P = np.zeros((self.layout.size, self.layout.size))
-        P[np.ix_(target, target)] = self.P[np.ix_(source, source)]
-        self.P = P
-        self.at = self.at[:n] + [0j if row < 0 else self.at[n + row] for row in rows]
-        self.heading = self.heading[:n] + [1.0 + 0j if row < 0 else self.heading[n + row] for row in rows]
-        self.velocity = [0j if row < 0 else self.velocity[row] for row in rows]
-        self.turn_radps = [0.0 if row < 0 else self.turn_radps[row] for row in rows]
+        before_V, self.layout = self.of_vehicles, StateLayout.of(n, M)
+        self.at = np.concatenate([self.at[:n], _selected(self.at[n:], kept, old, M, 0.0)])
+        self.heading = np.concatenate([self.heading[:n], _selected(self.heading[n:], kept, old, M, 1.0)])
+        self.velocity = _selected(self.velocity, kept, old, M, 0.0)
+        self.turn_radps = _selected(self.turn_radps, kept, old, M, 0.0)
+        self.with_egos = _selected(self.with_egos, kept, old, M, 0.0)
+        if not self.together:
+            self.of_vehicles = _selected(before_V, kept, old, M, 0.0)
+            return
+        of_vehicle = np.arange(OF_VEHICLE)
+        source, target = ((OF_VEHICLE * np.array([k], np.int64).T + of_vehicle).ravel() for k in (old, kept))
+        self.of_vehicles = np.zeros((1, OF_VEHICLE * M, OF_VEHICLE * M))
+        self.of_vehicles[0][np.ix_(target, target)] = before_V[0][np.ix_(source, source)]
+
+
+def _selected(numbers: NDArray[Any], kept: Sequence[int], old: Sequence[int], M: int, new: float) -> NDArray[Any]:
+    """(M, ...) of which `kept` are the `old` of these numbers, and the others `new`."""
+    out = np.full((M, *numbers.shape[1:]), new, numbers.dtype)
+    out[kept] = numbers[old]
+    return out
 
 
 def _se2(at: complex, heading: complex) -> SE2:
-    return SE2(at.real, at.imag, cmath.phase(heading))
+    return SE2(float(at.real), float(at.imag), cmath.phase(heading))

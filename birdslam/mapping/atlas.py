@@ -39,7 +39,7 @@ class AtlasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     map_cell_m: Positive = 0.25  # of the map, in the finest octave
     map_cells: Count = 4096  # in each octave, of landmarks and of lanes each
     map_octaves: Count = 5  # of the map: each is half as fine as the one before
-    epochs: Count = 3  # the newest ones
+    epochs: Count = 2  # the newest ones: that of now, and the one whose last map updates may still come
 
 
 class Atlas:

@@ -15,6 +15,7 @@ import numpy as np
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.factors.factor import Factor, GraphFrame, Linearised
+from birdslam.graph.state_layout import OF_VEHICLE
 from birdslam.graph.window import Window
 from birdslam.types import Lane, LineKind, Measurements
 
@@ -127,7 +128,7 @@ class EgoOnLines(Factor):
             middle = float(x.mean())
             turn, gap = np.polyfit(x - middle, curve.y_m[both] - np.interp(x, x_map, y_map), 1).tolist()
             residuals += [gap, turn]
-            J = np.zeros((2, len(window.P)))
+            J = np.zeros((2, window.layout.size))
             J[:, 1:3] = (-1.0, -middle), (0.0, -1.0)
             rows.append(J)
             covs.append(curve.cov + self._cov[curve.line])
@@ -167,7 +168,7 @@ class VehiclesOnLanes(Factor):
         """One edge for each vehicle of the window that a record is of."""
         row_of = {node.vehicle: row for row, node in enumerate(frame.vehicles.nodes)}
         residuals: list[float] = []
-        rows, covs = [], []
+        rows, by_own, covs = [], [], []
         for record in frame.records:
             if not isinstance(record, OnCurve) or record.vehicle not in row_of:
                 continue
@@ -178,12 +179,13 @@ class VehiclesOnLanes(Factor):
                 along = -along
             aside = (complex(record.T_ego_foot.x_m, record.T_ego_foot.y_m) - at) * along.conjugate()
             residuals += [aside.imag, cmath.phase(along * heading.conjugate())]
-            first, J = window.layout.firsts[row], np.zeros((2, len(window.P)))
-            J[0, first : first + 2] = -along.imag, along.real
-            J[1, first + 2] = 1.0
-            rows.append(J)
+            J = np.zeros((2, OF_VEHICLE))
+            J[0, :2] = -along.imag, along.real
+            J[1, 2] = 1.0
+            rows.append(row)
+            by_own.append(J)
             covs.append(np.diag([LASTS_FRAMES * record.aside_m**2, LASTS_FRAMES * record.along_rad**2]))
-        return Linearised(residuals, np.vstack(rows), np.array(covs), GATE) if rows else None
+        return Linearised(residuals, np.array(by_own), np.array(covs), GATE, rows) if rows else None
 
 
 # --- the most that lines could say ---

@@ -105,7 +105,7 @@ class Series:
     def in_a_shift(self) -> tuple[float, float]:
         """By what share it would grow in SHIFT_H as in its second half, and the sigma; NaN: too short to tell."""
         half = len(self.mib) // 2
-        gain, sigma = slope(self.t_s[half:], self.mib[half:])
+        gain, sigma = drift(self.t_s[half:], self.mib[half:])
         return gain * SHIFT_H / self.mib[0], sigma * SHIFT_H / self.mib[0]
 
     @property
@@ -140,6 +140,20 @@ def slope(t_s: ArrayLike, values: ArrayLike, of: Callable[[Floats], float] = np.
     gain = float(x @ z / (x @ x))
     left = z - z.mean() - gain * x
     return gain, float(np.sqrt(left @ left / (BLOCKS - 2) / (x @ x)))
+
+
+def drift(t_s: ArrayLike, values: ArrayLike) -> tuple[float, float]:
+    """What a series that keeps what it gains will gain in an hour, and the sigma of that; NaN: it is too short to tell.
+
+    Memory goes up in steps and stays there: what each block of it gains is independent, what it is off a line is not.
+    So one step, of a table that doubles or of more images at once than ever before, is one sigma.
+    """
+    t, y = np.asarray(t_s, dtype=np.float64) / 3600.0, np.asarray(values, dtype=np.float64)
+    if t.size < 2 * BLOCKS:
+        return float("nan"), float("nan")
+    gained = np.diff([np.median(block) for block in np.array_split(y, BLOCKS)])
+    hours = np.diff([block.mean() for block in np.array_split(t, BLOCKS)])
+    return float(gained.sum() / hours.sum()), float(gained.std(ddof=1) * np.sqrt(gained.size) / hours.sum())
 
 
 def sample(processes: Mapping[str, psutil.Process], into: Mapping[str, Series]) -> None:
@@ -212,7 +226,7 @@ def table(series: Mapping[str, Series], summary: dict[str, Any], systemd: System
     lines = ["| process | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
     for name, one in series.items():
         before, after = one.ends()
-        mib, descriptors = slope(one.t_s, one.mib), slope(one.t_s, one.descriptors)
+        mib, descriptors = drift(one.t_s, one.mib), slope(one.t_s, one.descriptors)
         cells = (
             *(f"{before:.1f}", f"{after:.1f}", f"{one.growth:+.2%}", "{:+.2f} +- {:.2f}".format(*mib)),
             "{:+.1%} +- {:.1%}".format(*one.in_a_shift()),

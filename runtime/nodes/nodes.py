@@ -206,6 +206,7 @@ def prepare(name: str, configuration: Configuration) -> Callable[[Bus, Callable[
         frontend = front_end(configuration, inference)
         return lambda bus, wait, assignment: PerceiveNode(configuration, inference, frontend, bus, assignment)
     if name == "optimize":
-        solver()
+        if configuration.slam.graph.vehicles_move_ego:
+            solver()
         return lambda bus, wait, assignment: OptimizeNode(configuration, bus, assignment)
     return lambda bus, wait, assignment: CaptureNode(configuration, bus, wait, assignment)

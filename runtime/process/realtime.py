@@ -38,7 +38,9 @@ _LOWER_NICE = 5  # nicer: a third of the time that one gets that wants the same 
 _NICEST = 19
 
 NODE_IMAGES = {"capture": 8, "perceive": 40}  # of the camera's size, in colour, that a node has at once at its worst
-NODE_OBJECTS_MIB, NODE_HEAP_MIB = 8.0, 4.0
+# ... and what does not go by the image: in perceive lane grids, and what networks, OpenCV and the solvers hold
+NODE_OBJECTS_MIB, NODE_HEAP_MIB = 8.0, {"perceive": 20.0}
+OTHER_HEAP_MIB = 4.0  # of a node that is not named there
 
 _TUPLE_SIZES, _TUPLES_KEPT = range(1, 21), 2_000  # what CPython keeps of freed ones, of each size
 
@@ -177,7 +179,7 @@ def reserve_for(node: str, configuration: Configuration) -> None:
     """`reserve` for what a node makes at work, when all that it loads is there."""
     camera = configuration.camera
     image_mib = 0.0 if camera is None else 3 * camera.width_px * camera.height_px / _MIB
-    reserve(NODE_OBJECTS_MIB, NODE_HEAP_MIB + NODE_IMAGES.get(node, 0) * image_mib)
+    reserve(NODE_OBJECTS_MIB, NODE_HEAP_MIB.get(node, OTHER_HEAP_MIB) + NODE_IMAGES.get(node, 0) * image_mib)
 
 
 def use_one_heap() -> None:

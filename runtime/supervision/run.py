@@ -49,7 +49,8 @@ from birdslam.sources.recording import DatasetError
 ANY_VEHICLE = Configuration().vehicle  # of one that is not named
 WITHOUT_MODELS = "no networks: odometry only, without vehicles and lanes"
 USER_MENDS = MapError, GnssError, EarthError, ConfigurationError  # of a map or fixes, when the drive is over
-DRIVE_MIB = 16.0, 8.0  # of objects and of tables: what atlas and results come to in a long drive among lane lines
+# Of objects and of tables: what the atlas (two epochs of 13 MiB at the most) and results come to among lane lines
+DRIVE_MIB = 32.0, 8.0
 
 
 def run(configuration: Configuration, lengths_by: LengthsBy | None = None) -> int:

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from birdslam.geometry.arrays import Floats
-from birdslam.graph.costs import Complexes
+from birdslam.geometry.arrays import Complexes, Floats
 from birdslam.types import Approach
 
 HORIZON_S = 30.0  # a later approach is reported as it would be then
@@ -19,30 +18,33 @@ SLOWEST_MPS2 = 0.01  # a squared velocity below it is none
 MOST = 1e9  # of any number that is reported
 
 
-def approaches(p: Complexes, v: Complexes, means: Floats, deviators: Complexes) -> list[Approach]:
+def approaches(p: Complexes, v: Complexes, covs: Floats) -> list[Approach]:
     """Of N road users, places p and velocities v (N,) against the ego's, in m and m/s, all in one frame.
 
-    `means` and `deviators` (2, N) are the covariances of p and of v, as costs.py has them.
+    `covs` (N, 4, 4) are the covariances of both, (x_m, y_m, x_mps, y_mps).
     """
     if not len(p):
         return []
-    square = np.maximum((v * v.conj()).real, SLOWEST_MPS2)
-    free = (p * v.conj()).real / -square
-    time = np.minimum(np.maximum(free, 0.0), HORIZON_S)
+    numbers = np.empty((4, len(p)))  # of each approach
+    time, sigma_s, distance, sigma_m = numbers
+    back = v.conj()
+    square = np.maximum((v * back).real, SLOWEST_MPS2)
+    free = (p * back).real / -square
+    np.minimum(np.maximum(free, 0.0), HORIZON_S, out=time)
     at = p + v * time
-    distance = np.abs(at)
-    # How time goes with p and v, and distance with them: a variance a'Ca is m |a|^2 + Re(d* a^2)
-    a = np.empty((2, 2, len(p)), np.complex128)
-    a[0] = v, p + 2.0 * free * v
-    a[0] /= square
-    a[1] = at / np.maximum(distance, 1e-6)  # towards them
-    a[1, 1] *= time
-    variances = means * (a.real**2 + a.imag**2) + (deviators.conj() * a * a).real
-    sigma_s, sigma_m = np.sqrt(np.maximum(variances[:, 0] + variances[:, 1], 0.0))
+    np.abs(at, out=distance)
+    by = np.empty((2, len(p), 2), np.complex128)  # how time goes with p and v, and distance with them
+    by[0, :, 0] = v / square
+    by[0, :, 1] = (p + 2.0 * free * v) / square
+    by[1, :, 0] = at / np.maximum(distance, 1e-6)  # towards them
+    by[1, :, 1] = by[1, :, 0] * time
+    J = by.view(np.float64)  # (2, N, 4)
+    variances = np.einsum("qni,nij,qnj->qn", J, covs, J)
+    np.sqrt(np.maximum(variances, 0.0), out=numbers[1::2])
     sigma_s *= free == time
+    np.minimum(numbers, MOST, out=numbers)
     soon = (time <= NEARBY_S) & (distance - NEARBY_SIGMA * sigma_m <= NEARBY_M)
-    rows = np.minimum(np.array([time, sigma_s, distance, sigma_m]), MOST).T.tolist()
     return [
         Approach(time_s=t, sigma_s=s, distance_m=d, sigma_m=e, nearby=near)
-        for (t, s, d, e), near in zip(rows, soon.tolist(), strict=True)
+        for (t, s, d, e), near in zip(numbers.T.tolist(), soon.tolist(), strict=True)
     ]

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from birdslam.graph.state_layout import POSE
 from birdslam.graph.vehicles import VehicleNode
 from birdslam.graph.window import Window
 from birdslam.lanes.users import UserInEgo, person_in_ego
@@ -20,13 +21,11 @@ def lane_users(
     people: Sequence[FollowedPerson],
 ) -> list[UserInEgo]:
     """Everybody; `vehicles` are the estimates of `nodes`. The covariances have nothing of the ego's error in world."""
-    T_ego_world, users = window.world.inverse(), list[UserInEgo]()
-    states = np.asarray(window.layout.poses[: len(nodes)])
-    covs = window.P[states[:, :, None], states[:, None, :]]  # (vehicles, 3, 3)
-    for node, estimate, cov in zip(nodes, vehicles, covs, strict=True):
+    T_ego_world, covs, users = window.world.inverse(), window.each_vehicle[:, POSE, POSE], []
+    for row, (node, estimate) in enumerate(zip(nodes, vehicles, strict=True)):
         T_ego_vehicle = T_ego_world @ estimate.T_world_vehicle
         by_size = node.size_bias_rel * np.array([T_ego_vehicle.x_m, T_ego_vehicle.y_m, 0.0])  # see marginals.py
-        cov += by_size[:, None] * by_size
+        cov = covs[row] + np.outer(by_size, by_size)
         yaw_rad = estimate.T_world_vehicle.yaw_rad
         speed_mps = estimate.velocity_mps[0] * math.cos(yaw_rad) + estimate.velocity_mps[1] * math.sin(yaw_rad)
         size = estimate.length_m

@@ -1,8 +1,8 @@
 """People in the world of the graph: those that the front end follows, from the ego's newest pose.
 
-They are filtered outside the joint graph (people/people_filter.py): sixty people more would not fit into a frame's
-millisecond, and a person's box says nothing of the ego. What they get here is the graph's world, epoch and ego, with
-the ego's covariance, and where frames bring no picture the way that they went on.
+They are filtered outside the graph (people/people_filter.py): as its nodes their speeds would be worse
+(docs/ablations.md), and a person's box says nothing of the ego. What they get here is the graph's world, epoch and ego,
+with the ego's covariance, and where frames bring no picture the way that they went on.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ def people_estimates(
     """
     if not people:
         return ()
-    flat = chain.from_iterable((f.x_m, f.y_m, f.vx_mps, f.vy_mps, *f.cov, *f.velocity_cov) for f in people)
-    table = np.fromiter(flat, np.float64, 12 * len(people)).reshape(-1, 12)
+    parts = [part for f in people for part in ((f.x_m, f.y_m, f.vx_mps, f.vy_mps), f.cov, f.velocity_cov)]
+    table = np.fromiter(chain.from_iterable(parts), np.float64, 12 * len(people)).reshape(-1, 12)
     sane = (np.abs(table) < _LIMITS).all(axis=1)
     if len(people) > MOST or not sane.all():
         away_m = np.hypot(table[:, 0], table[:, 1])
@@ -45,14 +45,16 @@ def people_estimates(
         kept = sorted(nearest, key=lambda k: people[k].person)
         people, table = [people[k] for k in kept], table[kept]
     p, v = np.ascontiguousarray(table[:, :4]).view(np.complex128).T
-    xx, xy, yy = (table[:, first::4].T for first in (4, 5, 7))
-    means, deviators = 0.5 * (xx + yy), 0.5 * (xx - yy) + 1j * xy  # of place and velocity, as costs.py has them
+    covs = np.zeros((len(people), 4, 4))
+    of_place, of_velocity = covs[:, :2, :2], covs[:, 2:, 2:]
+    of_place[...], of_velocity[...] = table[:, 4:8].reshape(-1, 2, 2), table[:, 8:].reshape(-1, 2, 2)
     if since_s > 0.0:
         p = p + v * since_s
-        means[0] += means[1] * since_s**2 + CHANGE_MPS**2 * since_s**3 / 3.0
-        deviators[0] += deviators[1] * since_s**2
-        means[1] += CHANGE_MPS**2 * since_s
-    near = approaches(p - complex(way.x_m, way.y_m), v - ego_mps, means, deviators)
+        of_place += of_velocity * since_s**2 + CHANGE_MPS**2 * since_s**3 / 3.0 * np.eye(2)
+        of_velocity += CHANGE_MPS**2 * since_s * np.eye(2)
+    near = approaches(p - complex(way.x_m, way.y_m), v - ego_mps, covs)
+    xx, xy, yy = (np.array([cov[:, i, j] for cov in (of_place, of_velocity)]) for i, j in ((0, 0), (0, 1), (1, 1)))
+    means, deviators = 0.5 * (xx + yy), 0.5 * (xx - yy) + 1j * xy  # as costs.py has them
     speed = np.abs(v)
     heading = np.where(speed > TURNS_MPS, v / np.maximum(speed, TURNS_MPS), 1.0)  # against the ego
     # The ego's error moves everybody: by its place, and by its yaw the more the farther they are

@@ -45,12 +45,15 @@ class Linearised:
     radians in the axes that the pose is in. The ego's own is in its own axes.
     """
 
-    residual: list[float]  # (k d,) measured minus predicted
-    jacobian: list[int] | Floats  # (k d, N); as a list of k d numbers: row i is the unit vector of the i-th of them
+    residual: Sequence[float] | Floats  # k d numbers: measured minus predicted
+    # (k d, E) by the ego's poses, or (k d, n) by all of the state; as a list of k d numbers: row i is the unit vector
+    # of the i-th of them. Of edges to single `vehicles` (k, d, 6) by each one's own numbers; as a list of d: the same
+    jacobian: list[int] | Floats
     covs: Floats  # (k, d, d) positive definite: inverses of the edges' information matrices
     # On the squared Mahalanobis distance of an edge: past it the covariance is multiplied by the square of the excess,
     # past four times it the edge is an outlier and left out. None: there are no outliers
     gate: float | None = None
+    vehicles: list[int] | None = None  # (k,) rows of the window, each once: whom each edge is to
     outliers: Sequence[int] = ()  # of the k edges, once the minimum is found
 
 
@@ -65,7 +68,10 @@ class Factor:
 
     name: str  # unique in the graph: "CV"
     equation: str  # of the paper, or what it is
-    of_vehicles: ClassVar[bool] = False  # its edges say where vehicles are; see `GraphConfig.vehicles_move_ego`
+    # Its edges say where single vehicles are, and by default leave the ego: see `GraphConfig.vehicles_move_ego`
+    of_vehicles: ClassVar[bool] = False
+    # It ties vehicles to each other, or the ego to where they are: the window then holds them in one block
+    ties_vehicles: ClassVar[bool] = False
     state_type: ClassVar[type | None] = None  # of `state`, for msgspec; None: it keeps nothing from frame to frame
 
     def begin(self) -> None:

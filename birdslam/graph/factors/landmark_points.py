@@ -14,8 +14,8 @@ from itertools import chain
 import msgspec
 import numpy as np
 
-from birdslam.geometry.arrays import Floats
-from birdslam.graph.costs import Complexes, Rows, inflation, point_costs
+from birdslam.geometry.arrays import Complexes, Floats, Ints
+from birdslam.graph.costs import inflation, point_costs
 from birdslam.graph.edges import LARGEST_M
 from birdslam.graph.factors.factor import Factor, GraphFrame, Linearised
 from birdslam.graph.graph_config import GraphConfig
@@ -44,7 +44,7 @@ class Sightings:
     deviators: Complexes
     shared: Complexes
 
-    def __getitem__(self, rows: Rows | slice) -> Sightings:
+    def __getitem__(self, rows: Ints | slice) -> Sightings:
         keys = self.keys[rows] if isinstance(rows, slice) else [self.keys[i] for i in rows.tolist()]
         return Sightings(keys, self.points[rows], self.means[rows], self.deviators[rows], self.shared[:, rows])
 
@@ -57,8 +57,8 @@ def sightings(edges: tuple[LandmarkEdge, ...]) -> Sightings:
     """
     latest = {(e.kind, e.landmark): e for e in edges}
     keys = list(latest)
-    flat = chain.from_iterable((e.x_m, e.y_m, *e.cov, *(e.shared or _NOTHING)) for e in latest.values())
-    table = np.fromiter(flat, np.float64, 10 * len(keys)).reshape(-1, 10)
+    parts = [part for e in latest.values() for part in ((e.x_m, e.y_m), e.cov, e.shared or _NOTHING)]
+    table = np.fromiter(chain.from_iterable(parts), np.float64, 10 * len(keys)).reshape(-1, 10)
     if np.abs(table).max(initial=0.0) > LARGEST_M:
         sane = np.abs(table).max(axis=1) <= LARGEST_M
         keys, table = [key for key, keep in zip(keys, sane.tolist(), strict=True) if keep], table[sane]
@@ -112,7 +112,7 @@ class LandmarksState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     anchored: Sightings
     information: Floats
     moment: Complexes
-    frames: Rows
+    frames: Ints
     yaw_rad: float
 
 
@@ -139,6 +139,7 @@ class LandmarkPoints(Factor):
     def begin(self) -> None:
         """No landmarks yet."""
         self._seen: Sightings | None = None  # of the newest frame; None: its CP edges do not count
+        self._known_now = np.zeros(0, np.int64), np.zeros(0, np.int64)  # `_known` of these
         self._row: dict[LandmarkKey, int] = {}
         self._anchored = sightings(())  # in the ego of the keyframe, or in world
         # Sums over the frames that each was seen in: information, information times position in world, frames
@@ -180,7 +181,7 @@ class LandmarkPoints(Factor):
         seen = self._seen = sightings(frame.measurements.cp) if self._in_world or window.is_keyframe else None
         if seen is None:
             return None
-        now, then = self._known(seen)
+        now, then = self._known_now = self._known(seen)
         if not len(now):
             return None
         points, means, deviators, shared = seen.points[now], seen.means[now], seen.deviators[now], seen.shared[:, now]
@@ -212,10 +213,10 @@ class LandmarkPoints(Factor):
         """
         if self._seen is None:
             return None
-        now, then = self._known(self._seen)
+        now, then = self._known_now
         return (self._seen.points[now], *self._in_ego(then, window)) if len(now) else None
 
-    def _in_ego(self, rows: Rows, window: Window) -> tuple[Complexes, complex]:
+    def _in_ego(self, rows: Ints, window: Window) -> tuple[Complexes, complex]:
         """Known landmarks in ego, and the heading there of what a frame sees: that of the CC edges alone."""
         T = window.world
         there = (self._anchored.points[rows] - complex(T.x_m, T.y_m)) * cmath.exp(-1j * T.yaw_rad)
@@ -229,8 +230,10 @@ class LandmarkPoints(Factor):
         """
         if self._seen is None:
             return
-        seen = self._seen[: self._capacity]
-        old, before = self._known(seen)
+        seen, (old, before) = self._seen, self._known_now
+        if len(seen.keys) > self._capacity:
+            seen = seen[: self._capacity]
+            old, before = self._known(seen)
         out_of_sight = np.ones(len(self._frames), np.bool_)
         out_of_sight[before] = False
         settles = np.flatnonzero(out_of_sight & (self._frames >= self._least_frames)).tolist()
@@ -253,7 +256,7 @@ class LandmarkPoints(Factor):
         self._row = {key: row for row, key in enumerate(seen.keys)}
         self._anchored = seen
 
-    def _known(self, seen: Sightings) -> tuple[Rows, Rows]:
+    def _known(self, seen: Sightings) -> tuple[Ints, Ints]:
         """Which of a frame's landmarks are known, and the row where each of these is kept."""
         row = self._row
         rows = np.array([row.get(key, -1) for key in seen.keys], dtype=np.int64)

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from birdslam.graph.costs import binary_residual
+from birdslam.graph.costs import binary_residuals
 from birdslam.graph.factors.factor import Factor, GraphFrame, Linearised
 from birdslam.graph.graph_config import GraphConfig
+from birdslam.graph.state_layout import POSE
 from birdslam.graph.window import Window
+
+OWN_POSE = [*range(POSE.start, POSE.stop)]
 
 
 class VehicleDetections(Factor):
@@ -23,25 +26,17 @@ class VehicleDetections(Factor):
 
     def predict(self, frame: GraphFrame, window: Window) -> None:
         """Turns vehicles round whose detection contradicts their heading by more than a right angle."""
-        if self._front_back_ambiguity:
-            now = window.heading[window.nodes :]
-            edges = frame.associations.cv
-            opposed = [row for row, _, heading, _ in edges if (heading * now[row].conjugate()).real < 0.0]
-            if opposed:
-                window.flip_headings(opposed)
+        edges = frame.associations.cv
+        if self._front_back_ambiguity and edges.rows:
+            opposed = (edges.heading * window.heading[window.nodes :][edges.rows].conj()).real < 0.0
+            if opposed.any():
+                window.flip_headings([edges.rows[k] for k in np.flatnonzero(opposed)])
 
     def linearise(self, frame: GraphFrame, window: Window) -> Linearised | None:
         """Each edge measures the three numbers of its vehicle's pose."""
         edges = frame.associations.cv
-        if not edges:
+        if not edges.rows:
             return None
-        firsts, now_at, now_heading = window.layout.firsts, window.at[window.nodes :], window.heading[window.nodes :]
-        index: list[int] = []
-        residual: list[float] = []
-        covs: list[float] = []
-        for row, at, heading, cov in edges:
-            first = firsts[row]
-            index += (first, first + 1, first + 2)
-            residual += binary_residual(at, heading, now_at[row], now_heading[row])  # Eq. 6: its CV edges
-            covs += cov
-        return Linearised(residual, index, np.fromiter(covs, np.float64, len(covs)).reshape(-1, 3, 3), self._gate)
+        at, heading = window.at[window.nodes :][edges.rows], window.heading[window.nodes :][edges.rows]
+        residuals = binary_residuals(edges.at, edges.heading, at, heading)  # Eq. 6: its CV edges
+        return Linearised(residuals, OWN_POSE, edges.covs, self._gate, edges.rows)

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from birdslam.graph.costs import Complexes
+from birdslam.geometry.arrays import Complexes
 from birdslam.graph.factors.factor import Factor, GraphFrame
 from birdslam.graph.factors.landmark_points import LandmarkPoints, landmark_residual
 from birdslam.graph.state_layout import EGO
@@ -24,6 +24,7 @@ class VehicleLandmarks(Factor):
 
     name = "CP of vehicles"
     equation = "Eqs. 3 and 7"
+    ties_vehicles = True
 
     def __init__(self, weight: float, landmarks: LandmarkPoints) -> None:
         self._weight = weight
@@ -41,7 +42,7 @@ class VehicleLandmarks(Factor):
         points, there, heading = known
         ego = complex(landmark_residual(there, 0.0, heading, points).mean())  # Eq. 7: all landmarks weigh alike
         places = [complex(T.x_m, T.y_m) for T in place_of.values()]
-        at = np.array([window.at[window.nodes + row] for row in place_of])
+        at = window.at[window.nodes :][[*place_of]]
         residuals = ego + heading * np.array(places) - at  # Eq. 3, of the vehicle
         _correct(window, [*place_of], residuals, 1.0 / (self._weight * len(points)), frame.zero_velocity)
 
@@ -51,19 +52,20 @@ def _correct(window: Window, rows: Sequence[int], residuals: Complexes, variance
 
     `variance_m2` is each edge's, in either axis; `hold` keeps the ego where it is.
     """
-    k, states = len(rows), window.layout.poses[rows]
-    at = np.array([window.at[window.nodes + row] for row in rows])
-    H = np.zeros((2 * k, len(window.P)))  # how the place in the world goes with the state
+    k, states, P = len(rows), window.layout.poses[rows], window.P
+    at = window.at[window.nodes :][rows]
+    H = np.zeros((2 * k, len(P)))  # how the place in the world goes with the state
     H[0::2, EGO.start] = H[1::2, EGO.start + 1] = 1.0
     H[0::2, EGO.start + 2], H[1::2, EGO.start + 2] = -at.imag, at.real
     H[2 * np.arange(k), states[:, 0]] = H[2 * np.arange(k) + 1, states[:, 1]] = 1.0
-    PHt = window.P @ H.T
+    PHt = P @ H.T
     K = np.linalg.solve(H @ PHt + variance_m2 * np.eye(2 * k), PHt.T).T
     residual = np.column_stack([residuals.real, residuals.imag]).ravel()
     dx, held = K @ residual, window.ego_cov.copy()
-    window.P -= K @ PHt.T
-    window.P = 0.5 * (window.P + window.P.T)
+    P -= K @ PHt.T
+    P = 0.5 * (P + P.T)
     if hold:
         dx[EGO] = 0.0
-        window.P[EGO, EGO] = held
-    window.shift(dx.tolist())
+        P[EGO, EGO] = held
+    window.set_P(P)
+    window.shift(dx)

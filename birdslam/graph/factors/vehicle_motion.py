@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import cmath
-
 import numpy as np
 
 from birdslam.geometry.constant_twist import advance, rate
-from birdslam.graph.costs import binary_residual, rotated
-from birdslam.graph.edges import VvEdge
+from birdslam.graph.costs import binary_residuals, rotated
 from birdslam.graph.factors.factor import Factor, GraphFrame, Linearised
+from birdslam.graph.state_layout import TWIST
 from birdslam.graph.window import Window
+
+OWN_TWIST = [*range(TWIST.start, TWIST.stop)]
 
 
 class VehicleMotion(Factor):
@@ -25,11 +25,10 @@ class VehicleMotion(Factor):
     def predict(self, frame: GraphFrame, window: Window) -> None:
         """The twists of the interval that leads to this frame."""
         edges = frame.associations.vv
-        if edges:
-            twists = [rate(complex(e.motion.x_m, e.motion.y_m), e.motion.yaw_rad, e.dt_s) for e in edges]  # Eq. 6: VV
-            intervals_s = np.array([e.dt_s for e in edges])
-            covs = np.array([e.cov for e in edges]).reshape(-1, 3, 3) / np.square(intervals_s)[:, None, None]
-            window.set_twists([e.row for e in edges], twists, covs)
+        if edges.rows:
+            velocity, turn_radps = rate(edges.at, edges.yaw_rad, edges.dt_s)  # Eq. 6: its VV edges
+            covs = edges.covs / np.square(edges.dt_s)[:, None, None]
+            window.set_twists(edges.rows, velocity, turn_radps, covs)
 
 
 class MeasuredTwist(Factor):
@@ -42,27 +41,16 @@ class MeasuredTwist(Factor):
     def linearise(self, frame: GraphFrame, window: Window) -> Linearised | None:
         """Each edge measures the three numbers of its vehicle's twist."""
         edges = frame.associations.vv
-        if not edges:
+        if not edges.rows:
             return None
-        index: list[int] = []
-        residual: list[float] = []
-        covs: list[float] = []
-        for e in edges:
-            first = window.layout.firsts[e.row] + 3
-            index += (first, first + 1, first + 2)
-            gap, cov = _of_twist(e, window.velocity[e.row], window.turn_radps[e.row])  # Eq. 6: its VV edges
-            residual += gap
-            covs += cov
-        return Linearised(residual, index, np.array(covs).reshape(-1, 3, 3))
-
-
-def _of_twist(edge: VvEdge, velocity: complex, turn_radps: float) -> tuple[list[float], list[float]]:
-    """What a VV edge says of the twist that the window has: residual (3,) and covariance (9,)."""
-    way, heading, by_velocity, by_turn = advance(1.0 + 0.0j, velocity, turn_radps, edge.dt_s)
-    T = edge.motion
-    measured = cmath.rect(1.0, T.yaw_rad)
-    g, d = by_velocity, by_turn
-    back = np.linalg.inv([[g.real, -g.imag, d.real], [g.imag, g.real, d.imag], [0.0, 0.0, edge.dt_s]])
-    residual = back @ binary_residual(complex(T.x_m, T.y_m), measured, way, heading)
-    cov = back @ np.reshape(rotated(edge.cov, measured), (3, 3)) @ back.T
-    return residual.tolist(), cov.ravel().tolist()
+        ahead, measured = np.ones(len(edges.rows), np.complex128), np.exp(1j * edges.yaw_rad)
+        velocity, turn_radps = window.velocity[edges.rows], window.turn_radps[edges.rows]
+        way, heading, g, d = advance(ahead, velocity, turn_radps, edges.dt_s)
+        J = np.zeros_like(edges.covs)  # of the way by the twist
+        J[:, 0, 0] = J[:, 1, 1] = g.real
+        J[:, 0, 1], J[:, 1, 0] = -g.imag, g.imag
+        J[:, 0, 2], J[:, 1, 2], J[:, 2, 2] = d.real, d.imag, edges.dt_s
+        back = np.linalg.inv(J)
+        residuals = back @ binary_residuals(edges.at, measured, way, heading)[:, :, None]  # Eq. 6: its VV edges
+        covs = back @ rotated(edges.covs, measured) @ back.transpose(0, 2, 1)
+        return Linearised(residuals, OWN_TWIST, covs, vehicles=edges.rows)
