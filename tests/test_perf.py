@@ -166,14 +166,14 @@ def test_runs_in_turn_compare_frames_with_a_look_and_without_by_themselves() -> 
         made.samples = [Sample(t, {"perceive": cpu_s * t, "optimize spare": 9.0 * t}, {}) for t in (0.0, 9.2)]
         return made
 
-    figures = {name: in_turn._figures(run(*of), system.split) for name, of in {"a": (1, 0.5), "b": (3, 0.6)}.items()}
+    figures = {name: in_turn.figures(run(*of), system.split) for name, of in {"a": (1, 0.5), "b": (3, 0.6)}.items()}
     assert (figures["a"]["looked"], figures["b"]["looked"]) == (1.0, pytest.approx(1 / 3, abs=1e-3))
     assert figures["b"]["age_ms"]["p50"] < figures["a"]["age_ms"]["p50"] - 8.0  # none of it in the frames themselves
     assert figures["b"]["age_looked_ms"]["p50"] == pytest.approx(figures["a"]["age_looked_ms"]["p50"], abs=1.5)
     assert figures["a"]["cpu_ms"]["mean"] == pytest.approx(0.5 * 9.2 / 300 * 1e3, abs=1e-3)  # no spare's
     pair = {"without": figures["a"], "with": figures["b"]}
-    assert in_turn._ratio(pair, "cpu_ms", "mean") == pytest.approx(1.2)
-    assert in_turn._ratio(pair, "age_carried_ms", "p50") is None  # there was none of them in one
+    assert in_turn.ratio_of(pair, "cpu_ms", "mean") == pytest.approx(1.2)
+    assert in_turn.ratio_of(pair, "age_carried_ms", "p50") is None  # there was none of them in one
 
 
 def test_the_parts_of_an_age_add_up_to_it() -> None:

@@ -50,7 +50,7 @@ def measure(ledger: Ledger, ask: Ask, part: str, pairs: int, split: Split, warm_
             rows.append({})
             for name in ("without", "with") if pair % 2 == 0 else ("with", "without"):
                 with drive(msgspec.structs.replace(ask, settings=(*ask.settings, *settings[name]))) as run:
-                    row = rows[-1][name] = _figures(run.after(warm_up_s), split)
+                    row = rows[-1][name] = figures(run.after(warm_up_s), split)
                 text = "; ".join(
                     f"{what} p50 {row[f'{what}_ms']['p50']:.2f} p99 {row[f'{what}_ms']['p99']:.2f} ms"
                     for what in ("age", *STEPS)
@@ -63,7 +63,7 @@ def measure(ledger: Ledger, ask: Ask, part: str, pairs: int, split: Split, warm_
     over = {
         f"{what} {at}": each
         for what, at in COMPARED
-        if (each := [ratio for pair in rows if (ratio := _ratio(pair, f"{what}_ms", at)) is not None])
+        if (each := [ratio for pair in rows if (ratio := ratio_of(pair, f"{what}_ms", at)) is not None])
     }
     text = "; ".join(
         f"{name} {np.median(each):.3f} ({', '.join(f'{ratio:.3f}' for ratio in each)})" for name, each in over.items()
@@ -71,13 +71,13 @@ def measure(ledger: Ledger, ask: Ask, part: str, pairs: int, split: Split, warm_
     ledger.add("with over without, median (each pair)", text, over=over)
 
 
-def _ratio(pair: dict[str, dict[str, Any]], what: str, at: str) -> float | None:
+def ratio_of(pair: dict[str, dict[str, Any]], what: str, at: str) -> float | None:
     """With over without; None where one of them has none of it."""
     made, plain = pair["with"][what].get(at), pair["without"][what].get(at)
     return round(made / plain, 3) if made is not None and plain else None
 
 
-def _figures(run: Run, split: Split) -> dict[str, Any]:
+def figures(run: Run, split: Split) -> dict[str, Any]:
     summary, parts = run.summary, split(run.messages)
     age_ms = np.array([(message.t_received_ns - message.record.t_capture_ns) / 1e6 for message in run.messages])
     carried = np.array([Status.DETECTIONS_CARRIED in message.record.status for message in run.messages], dtype=bool)
