@@ -77,6 +77,9 @@ def test_an_unmeasured_height_is_the_next_thing_to_measure() -> None:
     stated = LengthsBy("the camera's height of 1.35 m (as stated) and its focal length, +- 25%", 0.0, 0.25)
     (step,) = [line for line in verdict(drive(camera_sigma_rel=0.25, lengths_by=stated)) if line.startswith("Next")]
     assert "--fov DEG" in step
+    said = verdict(drive(camera_sigma_rel=0.25, lengths_by=stated._replace(view_is_stated=True)))
+    (step,) = [line for line in said if line.startswith("Next")]
+    assert step.startswith("Next: photograph a chessboard")  # who has stated the view is not asked for it
     both = LengthsBy("both", 0.1, 0.25)
     first, second = [line for line in verdict(drive(camera_sigma_rel=0.27, lengths_by=both)) if line.startswith("Next")]
     assert "--fov" in first  # what is least known

@@ -70,6 +70,7 @@ class LengthsBy(NamedTuple):
     height_sigma_rel: float = 0.0
     focal_sigma_rel: float = 0.0
     contradicted_by: str = ""  # what says another height than the one that was stated, and which
+    view_is_stated: bool = False  # how wide the camera sees, which leaves the focal length as sure as it is
 
 
 AS_STATED = LengthsBy()
@@ -146,7 +147,8 @@ def _next_steps(drive: DriveCounts) -> Iterable[str]:
         ),
         (
             focal_rel,
-            "say how wide the camera sees (--fov DEG), or photograph a chessboard (birdslam calibrate --chessboard): "
+            ("" if drive.lengths_by.view_is_stated else "say how wide the camera sees (--fov DEG), or ")
+            + "photograph a chessboard (birdslam calibrate --chessboard): "
             "5 % of focal length is 5 % of lengths along the road.",
         ),
     ]

@@ -87,7 +87,9 @@ def calibrate_drive(
                 raise CalibrationError(f"{uri}: {error}") from None
             found = _assumed(recording.camera, pitch, str(error))
     camera, height_by = with_height(found, known_height, lens, uri, is_film)
-    return Calibrated(camera, [*report(found, camera, height_by, uri, lens)], lengths_by(camera, height_by, lens))
+    return Calibrated(
+        camera, [*report(found, camera, height_by, uri, lens)], lengths_by(camera, height_by, lens, given.fov_deg)
+    )
 
 
 def _assumed(camera: Camera, pitch: TravelPitch | None, why: str) -> Calibration:

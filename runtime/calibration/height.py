@@ -138,8 +138,8 @@ def focal_sigma_rel(lens: Intrinsics | None) -> float:
     return lens.sigma_focal_px / lens.fx_px
 
 
-def lengths_by(camera: Camera, by: HeightBy, lens: Intrinsics | None) -> LengthsBy:
-    """What the metres of a camera rest on, for people."""
+def lengths_by(camera: Camera, by: HeightBy, lens: Intrinsics | None, fov_deg: float | None = None) -> LengthsBy:
+    """What the metres of a camera rest on, for people; `fov_deg` as the user states it."""
     words = f"the camera's height of {camera.height_m:.2f} m ({by.words})"
     focal_rel = focal_sigma_rel(lens)
     if by.check is not None and by.check.cue != VEHICLES:  # a known length holds both together
@@ -149,4 +149,4 @@ def lengths_by(camera: Camera, by: HeightBy, lens: Intrinsics | None) -> Lengths
     if by.shutter_rel >= 0.005:
         words += f"; rows that the camera reads one after the other leave +- {by.shutter_rel:.0%} at this speed"
     height_rel = math.sqrt(max(by.sigma_rel**2 - focal_rel**2, 0.0))
-    return LengthsBy(words, height_rel, focal_rel, by.contradicted_by)
+    return LengthsBy(words, height_rel, focal_rel, by.contradicted_by, fov_deg is not None)
