@@ -19,7 +19,7 @@ from birdslam.bench.simulation.drive import DriveConfig
 from birdslam.geometry.se2 import SE2
 from birdslam.perf.__main__ import main
 from birdslam.perf.errors import PerfError
-from birdslam.perf.latency import convoy, optimizer, system, transport
+from birdslam.perf.latency import convoy, in_turn, optimizer, system, transport
 from birdslam.perf.latency.live import Run, Sample
 from birdslam.perf.reporting import all as everything
 from birdslam.perf.reporting import compare, ratios, report, scorecard
@@ -151,6 +151,29 @@ def _run(budget_ms: float) -> Run:
         "configuration": {"budgets": {"perceive_ms": budget_ms}},
     }
     return Run(messages=messages, samples=samples, summary=summary, complete=True)
+
+
+def test_runs_in_turn_compare_frames_with_a_look_and_without_by_themselves() -> None:
+    """Their share follows the load of the moment, and the median of all frames jumps with it."""
+
+    def run(looked_every: int, cpu_s: float) -> Run:
+        made = _run(100.0)
+        for k, message in enumerate(made.messages):
+            looked = k % looked_every == 0
+            status = () if looked else (Status.DETECTIONS_CARRIED,)
+            record = msgspec.structs.replace(message.record, status=status)
+            made.messages[k] = Message(record, message.trace, message.t_received_ns + (10 * MS if looked else 0))
+        made.samples = [Sample(t, {"perceive": cpu_s * t, "optimize spare": 9.0 * t}, {}) for t in (0.0, 9.2)]
+        return made
+
+    figures = {name: in_turn.figures(run(*of), system.split) for name, of in {"a": (1, 0.5), "b": (3, 0.6)}.items()}
+    assert (figures["a"]["looked"], figures["b"]["looked"]) == (1.0, pytest.approx(1 / 3, abs=1e-3))
+    assert figures["b"]["age_ms"]["p50"] < figures["a"]["age_ms"]["p50"] - 8.0  # none of it in the frames themselves
+    assert figures["b"]["age_looked_ms"]["p50"] == pytest.approx(figures["a"]["age_looked_ms"]["p50"], abs=1.5)
+    assert figures["a"]["cpu_ms"]["mean"] == pytest.approx(0.5 * 9.2 / 300 * 1e3, abs=1e-3)  # no spare's
+    pair = {"without": figures["a"], "with": figures["b"]}
+    assert in_turn.ratio_of(pair, "cpu_ms", "mean") == pytest.approx(1.2)
+    assert in_turn.ratio_of(pair, "age_carried_ms", "p50") is None  # there was none of them in one
 
 
 def test_the_parts_of_an_age_add_up_to_it() -> None:

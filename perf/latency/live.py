@@ -24,7 +24,7 @@ from birdslam.perf.errors import PerfError
 from birdslam.perf.processes import birdslam_command, processes_of
 from birdslam.runtime.client import Planner
 from birdslam.runtime.fields import is_key
-from birdslam.runtime.topology import NODES
+from birdslam.runtime.topology import MAP, NODES
 from birdslam.runtime.transport.bus import Message
 from birdslam.sources.recording import Recording
 from birdslam.types import Status
@@ -159,7 +159,7 @@ def _finish(process: subprocess.Popen[bytes], ended: bool) -> None:
 def _sample(pid: int, now_s: float, with_pss: bool) -> Sample:
     sample = Sample(now_s, {}, {})
     with contextlib.suppress(psutil.NoSuchProcess):
-        for name, process in processes_of(pid, NODES).items():
+        for name, process in processes_of(pid, (*NODES, MAP.name)).items():
             with contextlib.suppress(psutil.NoSuchProcess), process.oneshot():
                 times = process.cpu_times()
                 sample.cpu_s[name] = times.user + times.system

@@ -39,7 +39,7 @@ _NICEST = 19
 
 NODE_IMAGES = {"capture": 8, "perceive": 40}  # of the camera's size, in colour, that a node has at once at its worst
 # ... and what does not go by the image: in perceive lane grids, and what networks, OpenCV and the solvers hold
-NODE_OBJECTS_MIB, NODE_HEAP_MIB = 8.0, {"perceive": 20.0}
+NODE_OBJECTS_MIB, NODE_HEAP_MIB = 8.0, {"perceive": 24.0}
 OTHER_HEAP_MIB = 4.0  # of a node that is not named there
 
 _TUPLE_SIZES, _TUPLES_KEPT = range(1, 21), 2_000  # what CPython keeps of freed ones, of each size
