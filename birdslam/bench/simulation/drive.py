@@ -16,13 +16,13 @@ import numpy as np
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.planar import between, compose, exp
 from birdslam.geometry.se2 import SE2, wrap
-from birdslam.graph.factors.lasting_error import DRIVING_MPS, kept
 from birdslam.types import EgoEdge, LandmarkEdge, LanePoint, Measurements, MotionEdge, Status, VehicleEdge
 
 Count = Annotated[int, msgspec.Meta(ge=0)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0.0)]
 
 _TABLE_STEP_M = 0.25  # the road is tabulated so finely
+_DRIVING_MPS = 1.0  # what is seen changes far above this speed, not below it
 
 
 class DriveConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -151,7 +151,7 @@ class _Camera:
     def measure(self, ego: Floats, vehicles: list[Floats]) -> list[Measurements]:
         config, last = self.config, 0
         speeds_mps = np.linalg.norm(np.diff(ego[:, :2], axis=0, prepend=ego[:1, :2]), axis=1) * config.rate_hz
-        driven_s = np.cumsum(-np.expm1(-speeds_mps / DRIVING_MPS)) / config.rate_hz
+        driven_s = np.cumsum(-np.expm1(-speeds_mps / _DRIVING_MPS)) / config.rate_hz
         last_seen: dict[int, int] = {}
         out = []
         for frame in range(config.frames):
@@ -230,8 +230,8 @@ class _Camera:
         new = self._rng.standard_normal(2)
         if vehicle in self._lasting:
             before, before_rel, then_s = self._lasting[vehicle]
-            fading_s = np.full(1, driven_s - then_s)
-            same = kept(sigma_rel[None], before_rel[None], fading_s, self.config.lasting_s)[0]
+            same = np.exp((then_s - driven_s) / self.config.lasting_s)
+            same = same * np.minimum(sigma_rel, before_rel) / np.maximum(sigma_rel, before_rel)
             new = same * before + np.sqrt(1.0 - same**2) * new
         self._lasting[vehicle] = new, sigma_rel, driven_s
         return new
