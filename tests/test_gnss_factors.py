@@ -6,6 +6,7 @@ import json
 import math
 import os
 import pty
+import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -159,6 +160,31 @@ def test_what_is_written_opens_elsewhere(tmp_path: Path) -> None:
 def test_a_drive_without_places_has_nothing_beside_them(tmp_path: Path) -> None:
     write_places(tmp_path, [])
     assert write_around(tmp_path) == []
+
+
+def test_what_lies_beside_a_drive_takes_memory_as_the_drive_is_long(tmp_path: Path) -> None:
+    """Points and places both grow with it; of all pairs of them, half an hour was 76 GB."""
+
+    def peak_bytes(length_m: int) -> int:
+        poses = [SE2(float(x_m), 0.0, 0.0) for x_m in range(length_m)]
+        earth = (*ORIGIN, 0.0, 1.0)
+        write_places(tmp_path, [Place(k * 10**9, 0, T, SE2(5.0, 0.0, 0.0) @ T, earth) for k, T in enumerate(poses)])
+        seen = [(k / 4.0, f"{k / 4.0:.2f}") for k in range(4 * length_m)]
+        rows = "".join(f"0,landmark,{x_m},2.000,-1\n" for _, x_m in seen)
+        (tmp_path / "map.csv").write_text("epoch,kind,x_m,y_m,lane\n" + rows)
+        (tmp_path / "tracks").mkdir(exist_ok=True)
+        (tmp_path / "tracks" / "3.tum.txt").write_text("".join(f"{t_s:.2f} {x_m} 2 0 0 0 0 1\n" for t_s, x_m in seen))
+        tracemalloc.start()
+        try:
+            write_around(tmp_path)
+            return tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+    peak_bytes(100)  # what is loaded once
+    assert peak_bytes(2000) < 3.0 * peak_bytes(1000)
+    points = json.loads((tmp_path / "road.map.geojson").read_text())["features"][0]["geometry"]["coordinates"]
+    assert points[:4000:1000] == [[5.0 + k / 4.0, 2.0] for k in range(0, 4000, 1000)]
 
 
 def test_road_and_tracks_lie_beside_the_way_on_earth(tmp_path: Path) -> None:

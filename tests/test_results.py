@@ -17,6 +17,7 @@ from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.outputs.bev_picture import Track
 from birdslam.outputs.drive_files import Recorder, ResultsError, claim_directory
+from birdslam.outputs.placed import ROAD_IN_MAP, Place, write_places
 from birdslam.outputs.scene_recorder import SceneRecorder, Thinned
 from birdslam.trajectory import read_kitti, read_tum
 from birdslam.types import Attitude, Estimate, MapUpdate, Moves, SpeedSource, Status, VehicleEstimate
@@ -50,6 +51,16 @@ def vehicle(number: int, pose: SE2, frames: int, speed_mps: float = 0.0, **field
         frames=frames,
         **fields,  # type: ignore[arg-type]
     )
+
+
+def test_the_counts_of_a_drive_are_there_though_the_disk_fails_what_is_made_of_its_files(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path, CAMERA)
+    recorder.add(estimate(0, SE2()))
+    write_places(tmp_path, [Place(0, 0, SE2(), SE2())])
+    (tmp_path / ROAD_IN_MAP).mkdir()
+    with pytest.raises(IsADirectoryError):
+        recorder.finish({})
+    assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 1
 
 
 def test_a_drive(tmp_path: Path) -> None:

@@ -179,7 +179,6 @@ class Recorder:
         `lengths_by`: what the camera's height and lens rest on; None: what is stated of them.
         """
         self.close()
-        write_around(self._directory)
         sigmas = self._sigmas.array()
         counts: dict[str, Any] = {
             "frames": self._frames,
@@ -199,6 +198,7 @@ class Recorder:
         sentences = verdict(DriveCounts(**known, lengths_by=lengths_by or self._stated()))
         encoded = msgspec.json.encode({**counts, "verdict": sentences, **summary}, enc_hook=_plain)
         (self._directory / "summary.json").write_bytes(msgspec.json.format(encoded, indent=2) + b"\n")
+        write_around(self._directory)  # what is made of other files comes after what is nowhere else
         name, lines = self._directory.resolve().name, tuple(self._lines.drawn())
         counted = {"path_m": self._path_m, "frames": self._frames, "track_count": self._track_count}
         scene = self._scene.scene(name=name, sigma_rel=self._camera.scale_sigma_rel, lines=lines, **counted)

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+from scipy.spatial import cKDTree
 
 from birdslam.geometry.arrays import Floats, Ints
 from birdslam.geometry.se2 import SE2
@@ -108,11 +109,12 @@ class _Line:
 
 
 class _Places:
-    """The rows of places.csv (N, 12)."""
+    """The rows of places.csv (N, 12). Looked up by trees: both rows and what is placed grow with the drive."""
 
     def __init__(self, table: Floats) -> None:
         self._t_s, self._epoch = table[:, 0], table[:, 1]
         self._odom, self._map, self._earth = table[:, 2:5], table[:, 5:8], table[:, 8:]
+        self._times = cKDTree(table[:, :1])
         self.on_earth = bool(np.isfinite(self._earth).all())
 
     def _from_ego(self, points_m: Floats, rows: Ints) -> Floats:
@@ -129,8 +131,7 @@ class _Places:
             rows = np.flatnonzero(self._epoch == epoch)
         if not len(rows):
             rows = np.arange(len(self._t_s))
-        apart = np.hypot(*(points_m[:, None, :] - self._odom[None, rows, :2]).transpose(2, 0, 1))
-        out: Ints = rows[apart.argmin(axis=1)]
+        out: Ints = rows[cKDTree(self._odom[rows, :2]).query(points_m)[1]]
         return out
 
     def in_map(self, points_m: Floats, epoch: int, from_s: float = -np.inf, to_s: float = np.inf) -> Floats:
@@ -142,8 +143,7 @@ class _Places:
 
     def degrees_at(self, timed: Floats) -> Floats:
         """Of rows of time and place."""
-        rows = np.abs(timed[:, :1] - self._t_s[None]).argmin(axis=1)
-        return self._degrees(timed[:, 1:3], rows)
+        return self._degrees(timed[:, 1:3], self._times.query(timed[:, :1])[1])
 
     def _degrees(self, points_m: Floats, rows: Ints) -> Floats:
         import pymap3d  # here: only who goes to Earth needs it
