@@ -7,8 +7,10 @@ import os
 import resource
 import signal
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -21,8 +23,10 @@ from msgspec.structs import replace
 from birdslam.runtime.cli.main import main
 from birdslam.runtime.client import Planner
 from birdslam.runtime.configuration import Configuration, ConfigurationError, RecordingConfig, SourceConfig
-from birdslam.runtime.nodes.recorder import about
+from birdslam.runtime.nodes.capture import stamps
+from birdslam.runtime.nodes.recorder import Recorder, about
 from birdslam.runtime.nodes.sources import open_source
+from birdslam.runtime.process.vitals import Vitals
 from birdslam.runtime.recording import append_only as appendonly
 from birdslam.runtime.recording import scene
 from birdslam.runtime.recording.append_only import AppendOnlyFile
@@ -37,10 +41,11 @@ from birdslam.runtime.recording.recording import (
 )
 from birdslam.runtime.replay.replay import compare
 from birdslam.runtime.supervision.recording_files import choose_file
-from birdslam.runtime.wire import Health, decode, encode
+from birdslam.runtime.transport.bus import Message
+from birdslam.runtime.wire import Health, Trace, decode, encode
 from birdslam.sources.camera_file import load_camera
 from birdslam.sources.recording import DatasetError
-from birdslam.types import Estimate, Measurements, Status
+from birdslam.types import Estimate, FrameRef, Measurements, Status
 from tests.taped_drive import CAMERA, Tape, measured
 from tests.test_bus import until
 from tests.test_pipeline import HEIGHT, LIMIT_S, UNHURRIED, WIDTH, Run, drive, wait_gone
@@ -412,3 +417,42 @@ def test_a_recorder_is_restarted_with_a_new_file_and_ends_where_the_disk_is_full
     assert "cut off" in capsys.readouterr().out
     assert main(["run", "--source", f"kitti:{drive}", "--record", str(files[0])]) == 2
     assert "exists" in capsys.readouterr().err
+
+
+class Backlog:
+    """In the bus's place: as much waits as a recorder finds that had no core for seconds."""
+
+    dropped = malformed = 0
+
+    def __init__(self, waiting: Iterable[Message] = ()) -> None:
+        self._waiting = deque(waiting)
+
+    def recv(self, timeout_s: float | None = None) -> Message | None:
+        return self._waiting.popleft() if self._waiting else None
+
+
+def test_a_recorder_that_catches_up_shows_life_with_each_message(tmp_path: Path) -> None:
+    """Its watchdog leaves out the time without a core, not what it takes to write all that waited meanwhile."""
+    configuration = Configuration(vehicle="late", camera=CAMERA)
+    messages = [Message(FrameRef(**stamps(m)), Trace(), m.t_capture_ns) for m in measured(200)]
+    written: list[int] = []
+
+    class Watched(Vitals):
+        def beat(self) -> None:
+            super().beat()
+            written.append(writer.messages)
+
+    bus = SimpleNamespace(
+        subscriber=lambda topic, depth: Backlog(messages if topic == "frame" else ()),
+        publisher=lambda topic: SimpleNamespace(put=lambda record: None),
+        on_alive=lambda tell: None,
+    )
+    writer = RecordingWriter(tmp_path / "late.mcap", about(configuration, {}), CAMERA, flush_ms=1e-6, sync=False)
+    recorder = Recorder(configuration, bus, writer, Watched())  # type: ignore[arg-type]
+    written.clear()
+    assert recorder.record_received(0.0)
+    assert writer.messages >= 200
+    assert max(np.diff(written)) <= 5
+    assert writer.handed_bytes > 0
+    writer.close(recorder.end())
+    assert len([*Recording(tmp_path / "late.mcap").messages(("v1/frame",))]) == 200

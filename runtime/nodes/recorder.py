@@ -105,24 +105,31 @@ class Recorder:
         for topic, subscriber in (("estimate", self._estimates), *self._others.items()):
             while (message := subscriber.recv(0.0)) is not None:
                 received.append((topic, message))
+                self._vitals.beat()  # each is decoded here
         while self._events:
             t_ns, event = self._events.popleft()
             self._writer.draw("/alive", event, t_ns)
         received.sort(key=lambda pair: pair[1].t_received_ns)
         for topic, message in received:
             self._take(topic, message)
+            self._show_life()
         now_ns = time.monotonic_ns()
         if now_ns - self._reported_ns >= HEALTH_NS:
             self._report_health(now_ns)
         if self._checkpoints is not None and self._first_measured is not None:
             self._begin_from_checkpoint(self._checkpoints, self._first_measured, now_ns)
-        self._vitals.count(frames=self._writer.messages, torn=self.torn, **self._counters())
+        self._vitals.count(torn=self.torn, **self._counters())
+        self._show_life()
+        return bool(received)
+
+    def _show_life(self) -> None:
+        """After each message: what waited while it had no core takes seconds to write, and all of it is one turn."""
+        self._vitals.count(frames=self._writer.messages)
         self._vitals.beat()
-        if self._writer.flush_if_due(now_ns):
+        if self._writer.flush_if_due(time.monotonic_ns()):
             self._handed.append((self._writer.handed_bytes, self._estimate_frame + 1))
         while self._handed and self._handed[0][0] <= self._writer.written_bytes:
             self._vitals.count(next_frame=self._handed.popleft()[1])
-        return bool(received)
 
     def _begin_from_checkpoint(self, path: Path, first_frame: int, now_ns: int) -> None:
         """As soon as there is one from which on all measurements are in this file."""
