@@ -154,6 +154,21 @@ def test_a_planner_is_told_where_it_is_in_the_map(
     assert {"localised"} <= {pose["state"] for pose in recorded}
 
 
+def test_all_that_a_look_needs_is_loaded_before_the_first_frame(
+    tmp_path_factory: pytest.TempPathFactory, road: Path
+) -> None:
+    """A new map is looked up in only when it has places."""
+    place = tmp_path_factory.mktemp("e")
+    with (
+        live(place, road, "--map", str(place / "new.map")) as run,
+        Planner(run.vehicle, run.runtime_dir) as planner,
+    ):
+        first = in_map(planner, lambda here: here.pose is not None, "the map process is at work").pose
+        assert first is not None
+        assert first.keyframes == 0
+        assert "faiss" in Path(f"/proc/{run.node_pid('map')}/maps").read_text()
+
+
 def test_nobody_notices_that_the_map_process_dies_stalls_and_has_a_full_disk(
     tmp_path_factory: pytest.TempPathFactory, road: Path, kept: bytes
 ) -> None:

@@ -264,6 +264,8 @@ class LiveMap:
 
 def localise(configuration: Configuration, assignment: Assignment, vitals: Vitals, stop: Stop) -> int:
     """The whole work of the process; its exit status."""
+    import faiss  # noqa: F401  # now, and not with the first look-up in the middle of the drive
+
     with Bus(configuration.vehicle, MAP.name, runtime_dir=configuration.runtime_dir) as bus:
         try:
             live = LiveMap(configuration, bus, vitals, assignment)
