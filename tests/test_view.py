@@ -5,8 +5,10 @@ from __future__ import annotations
 import importlib.util
 import re
 import subprocess
+import sys
 import urllib.request
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,7 @@ import psutil
 import pytest
 
 from birdslam.perf.browser.chromium import SOFTWARE_GL, chromium
+from birdslam.runtime.cli.main import main
 from birdslam.runtime.configuration import RecordingConfig
 from birdslam.runtime.recording import scene
 from birdslam.runtime.recording.recording import Latency, Recording
@@ -39,6 +42,17 @@ def tape(tmp_path: Path) -> Tape:
         tape.writer.draw("/latency", latency, number)
     tape.end(frames[-1])
     return tape
+
+
+def test_what_is_no_recording_is_refused_before_a_page_is_served(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    web = SimpleNamespace(WebViewer=lambda port: pytest.fail("it serves a page"))
+    monkeypatch.setitem(sys.modules, "birdslam.runtime.recording.rerun_web", web)
+    assert main(["view", str(tmp_path), "--web"]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert f"{tmp_path}: can't be read: Is a directory" in said.err
 
 
 @needs_rerun

@@ -22,23 +22,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Shows it; 1 where nothing came from a vehicle."""
+    recording = None if options.what == "live" else Recording(Path(options.what))  # refused before a page is served
     if options.web is None:
-        return _show(options, options.save)
+        return _show(options, recording, options.save)
     from birdslam.runtime.recording.rerun_web import WebViewer  # rerun is an extra
 
     with WebViewer(options.web) as viewer:
         print(f"open {viewer.page}", flush=True)
-        status = _show(options, viewer.data)
+        status = _show(options, recording, viewer.data)
         if options.seconds is None and not status:
             print("it is over; Ctrl-C ends the viewer too", flush=True)
             viewer.wait()
     return status
 
 
-def _show(options: argparse.Namespace, to: Path | str | None) -> int:
+def _show(options: argparse.Namespace, recording: Recording | None, to: Path | str | None) -> int:
     from birdslam.runtime.recording.rerun_view import show_live, show_recording
 
-    if options.what == "live":
+    if recording is None:
         return int(not show_live(options.vehicle, options.runtime_dir, to, options.seconds))
-    show_recording(Recording(Path(options.what)), to)
+    show_recording(recording, to)
     return 0
