@@ -17,8 +17,9 @@ LEAST_LEADER = 0.5  # probability of the ego's lane
 FARTHEST_M = 120.0
 BEND_SIGMA_PER_M = 0.002  # 1-sigma of a lane's curvature beyond where it was seen
 # The share of those who drive that comes towards the ego, where nothing has shown it yet: beside the ego's lane, and
-# beyond all that are known, where the other carriageway is as likely as a lane nobody has found
-AGAINST_BESIDE, AGAINST_BEYOND = 0.25, 0.6
+# beyond all that are known. By the labels of KITTI tracking 0000 to 0020, each car once at a side: 48 of 81 that are 2
+# to 5.5 m aside, 71 of 93 up to 15 m; both sides together, since nothing says on which one drives here
+AGAINST_BESIDE, AGAINST_BEYOND = 0.59, 0.76
 
 
 def with_users(lanes: Lanes, users: Sequence[UserInEgo], ego_mps: float, traffic: Traffic) -> Lanes:
