@@ -23,6 +23,7 @@ from birdslam.loops.gnss.earth import EarthError, GnssFix, place_on_earth
 from birdslam.loops.gnss.factors import Node, OnEarth, fixed_keyframes, tie
 from birdslam.loops.gnss.sentences import NmeaReader
 from birdslam.loops.keyframe import Link
+from birdslam.outputs import placed
 from birdslam.outputs.placed import Place, write_around, write_places
 from birdslam.runtime.configuration import ConfigurationError, load
 from birdslam.runtime.maps.drive_earth import write_earth
@@ -185,6 +186,33 @@ def test_what_lies_beside_a_drive_takes_memory_as_the_drive_is_long(tmp_path: Pa
     assert peak_bytes(2000) < 3.0 * peak_bytes(1000)
     points = json.loads((tmp_path / "road.map.geojson").read_text())["features"][0]["geometry"]["coordinates"]
     assert points[:4000:1000] == [[5.0 + k / 4.0, 2.0] for k in range(0, 4000, 1000)]
+
+
+def test_points_of_a_long_drive_are_brought_into_the_map_so_many_at_a_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However many there are, they take the same memory."""
+    monkeypatch.setattr(placed, "MOST_TOGETHER", 1000)
+    write_places(tmp_path, [Place(0, 0, SE2(), SE2(5.0, 0.0, 0.0))])
+
+    def peak_bytes(points: int) -> int:
+        rows = "".join(f"{k % 2},landmark,{k}.000,2.000,-1\n" for k in range(points))
+        (tmp_path / "map.csv").write_text("epoch,kind,x_m,y_m,lane\n" + rows)
+        tracemalloc.start()
+        try:
+            write_around(tmp_path)
+            return tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+    peak_bytes(100)  # what is loaded once
+    few = peak_bytes(4000)
+    assert peak_bytes(16_100) < 1.5 * few
+    features = json.loads((tmp_path / "road.map.geojson").read_text())["features"]
+    found: dict[int, list[list[float]]] = {0: [], 1: []}
+    for feature in features:
+        found[feature["properties"]["epoch"]] += feature["geometry"]["coordinates"]
+    assert found == {epoch: [[5.0 + k, 2.0] for k in range(epoch, 16_100, 2)] for epoch in (0, 1)}
 
 
 def test_road_and_tracks_lie_beside_the_way_on_earth(tmp_path: Path) -> None:

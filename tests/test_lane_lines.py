@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from birdslam.bench.lanes.kitti_road import Still, find_lane, find_pairs, iou, score
 from birdslam.bench.lanes.true_lines import LineScores, TrueLine
+from birdslam.bench.lanes.true_vehicles import VehicleScores, true_place
 from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
@@ -36,7 +37,18 @@ from birdslam.runtime.evaluation.still_lanes import evaluate_stills
 from birdslam.runtime.recording import scene
 from birdslam.runtime.recording.foxglove import SceneUpdate
 from birdslam.sources.recording import DatasetError
-from birdslam.types import Bound, Estimate, FollowedPerson, LaneChange, LaneLine, Lanes, LineKind
+from birdslam.sources.shipped_drive import TrueBody
+from birdslam.types import (
+    Bound,
+    Estimate,
+    FollowedPerson,
+    LaneChange,
+    LaneLine,
+    Lanes,
+    LineKind,
+    VehicleEstimate,
+    VehicleLane,
+)
 
 CAMERA = Camera(640, 240, 420.0, 420.0, 319.5, 90.0, height_m=1.5)
 NOBODY = np.zeros((0, 4))
@@ -419,6 +431,92 @@ def test_who_walks_is_in_a_lane_and_leads_nobody_who_cycles_does() -> None:
     assert found.leader.vehicle == 6
 
 
+def test_a_lane_that_leads_along_the_line_of_sight_needs_no_distance() -> None:
+    leads_aside = msgspec.structs.replace(line(0, 1.75), slope=0.2), msgspec.structs.replace(line(1, -1.75), slope=0.2)
+    lanes = EgoLane().lanes(leads_aside, 0, 0.0)
+    far = np.array([6.0, 1.2, 0.0])  # the distance is off by 6 m, and with it the place aside
+    on_sight = UserInEgo(1, SE2(30.0, 6.0, 0.0), np.outer(far, far), 4.0, 8.0)
+    ahead = UserInEgo(2, SE2(30.0, 6.0, 0.0), np.diag([36.0, 0.01, 0.01]), 4.0, 8.0)
+    surely, perhaps = with_users(lanes, [on_sight, ahead], 10.0, Traffic()).vehicles
+    assert lanes.ego is not None
+    of_lane_m = lanes.ego.sigma_m(30.0)
+    assert surely.ego_lane == pytest.approx(math.erf(1.75 / of_lane_m / math.sqrt(2)), abs=1e-3)
+    assert perhaps.ego_lane == pytest.approx(math.erf(1.75 / math.hypot(1.2, 0.1, of_lane_m) / math.sqrt(2)), abs=1e-3)
+
+
+def test_beyond_a_line_where_others_drove_who_is_new_drives_too() -> None:
+    lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0, 0.0)
+    cov = np.diag([1.0, 0.04, 0.01])
+    new = UserInEgo(9, SE2(40.0, 12.0, math.pi), cov, 4.0, 0.0, 8.0, standing=0.7)
+
+    def place_after(others: list[UserInEgo]) -> VehicleLane:
+        traffic = Traffic()
+        for _ in range(3):  # each counts once
+            with_users(lanes, others, 10.0, traffic)
+        again = Traffic(msgspec.msgpack.decode(msgspec.msgpack.encode(traffic.state()), type=TrafficState))
+        (place,) = with_users(lanes, [new], 10.0, again).vehicles
+        return place
+
+    unknown = place_after([])
+    assert unknown.off_road > unknown.oncoming
+    drove = place_after([UserInEgo(k, SE2(30.0, 12.0, math.pi), cov, 4.0, 20.0) for k in (1, 2)])
+    assert drove.oncoming > 0.7 > 2.0 * unknown.oncoming
+    stood = place_after([UserInEgo(k, SE2(30.0, 12.0, math.pi), cov, 4.0, 0.0, 0.1, standing=0.95) for k in (1, 2)])
+    assert stood.oncoming < 0.5 * unknown.oncoming
+
+
+def true_line(number: int, kind: str, y_m: float) -> TrueLine:
+    x = np.arange(0.0, 80.0, 2.0)
+    return TrueLine(number, kind, np.column_stack([x, np.full(len(x), y_m)]))
+
+
+def body(number: int, x_m: float, y_m: float, yaw_rad: float = 0.0, label: str = "car", mps: float = 14.0) -> TrueBody:
+    velocity_mps = mps * math.cos(yaw_rad), mps * math.sin(yaw_rad)
+    return TrueBody(
+        number, label, SE2(x_m, y_m, yaw_rad), 4.0, 1.8, 1.5, velocity_mps, 1.0, 0.0, (0.0, 0.0, 9.0, 9.0)
+    )  # fmt: skip
+
+
+def test_a_vehicle_stands_for_the_body_in_its_direction() -> None:
+    """A tenth too near, the leader stood for the car of the lane beside, which is nearer to it in metres."""
+    truth = tuple(true_line(k, "dashed", y) for k, y in enumerate((5.4, 1.8, -1.8, -5.4)))
+    bodies = body(1, 60.0, 0.0), body(2, 56.0, -3.6), body(3, 54.0, 2.0, label="pedestrian", mps=1.0)
+    lanes = EgoLane().lanes((line(0, 1.8), line(1, -1.8)), 0, 0.0)
+    lanes = with_users(
+        lanes, [UserInEgo(7, SE2(54.5, -0.2, 0.0), np.diag([16.0, 0.02, 0.01]), 4.0, 14.0)], 14.0, Traffic()
+    )
+    vehicle = VehicleEstimate(
+        vehicle=7, T_world_vehicle=SE2(54.5, -0.2, 0.0), cov=(*np.eye(3).ravel().tolist(),), velocity_mps=(14.0, 0.0),
+        velocity_cov=(1.0, 0.0, 0.0, 1.0), age_ns=0, frames=9,
+    )  # fmt: skip
+    estimate = Estimate(
+        epoch=0,
+        frame_id=0,
+        t_source_ns=0,
+        t_capture_ns=0,
+        t_utc_ns=0,
+        T_world_ego=SE2(),
+        cov=(0.0,) * 9,
+        valid=True,
+        vehicles=(vehicle,),
+        lanes=lanes,
+    )
+    scores = VehicleScores()
+    scores.add(estimate, bodies, truth)
+    report = scores.report()
+    assert (report.vehicles, report.right, report.leader_right) == (1, 1.0, 1.0)
+    assert report.gap_error_median_m == pytest.approx(5.5)
+
+
+def test_the_lane_between_the_last_dashes_and_the_kerb_is_on_the_road() -> None:
+    lines = ("kerb", -5.0), ("solid", -1.8), ("dashed", 1.8), ("dashed", 5.2), ("kerb", 8.6)
+    truth = tuple(true_line(k, kind, y) for k, (kind, y) in enumerate(lines))
+    assert true_place(body(1, 30.0, 6.9, math.pi), truth) == "oncoming"
+    assert true_place(body(2, 30.0, 9.5, math.pi), truth) == "off_road"
+    assert true_place(body(3, 30.0, -3.4), truth) == "off_road"  # beyond a solid line
+    assert true_place(body(4, 30.0, 3.4, math.pi), truth[:3] + truth[4:]) == "oncoming"
+
+
 def test_traffic_tells_which_way_a_lane_runs() -> None:
     lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0, 0.0)
     cov = np.diag([1.0, 0.04, 0.01])
@@ -427,7 +525,7 @@ def test_traffic_tells_which_way_a_lane_runs() -> None:
     before = with_users(lanes, [unknown], 10.0, traffic)
     assert before.lanes[0].oncoming is None
     assert before.lanes[1].oncoming == 0.0
-    assert before.vehicles[0].left == pytest.approx(0.75, abs=0.01)
+    assert before.vehicles[0].left == pytest.approx(1.0 - 48 / 81, abs=0.01)  # as KITTI's labels have it
     for _ in range(3):  # one car counts once
         told = with_users(lanes, [UserInEgo(1, SE2(30.0, 3.4, math.pi), cov, 4.0, 9.0), unknown], 10.0, traffic)
     assert told.lanes[0].oncoming == pytest.approx(1.0 / (1.0 + math.exp(-2.0)))

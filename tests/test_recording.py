@@ -427,6 +427,9 @@ class Backlog:
     def __init__(self, waiting: Iterable[Message] = ()) -> None:
         self._waiting = deque(waiting)
 
+    def __len__(self) -> int:
+        return len(self._waiting)
+
     def recv(self, timeout_s: float | None = None) -> Message | None:
         return self._waiting.popleft() if self._waiting else None
 
@@ -435,24 +438,28 @@ def test_a_recorder_that_catches_up_shows_life_with_each_message(tmp_path: Path)
     """Its watchdog leaves out the time without a core, not what it takes to write all that waited meanwhile."""
     configuration = Configuration(vehicle="late", camera=CAMERA)
     messages = [Message(FrameRef(**stamps(m)), Trace(), m.t_capture_ns) for m in measured(200)]
+    frames = Backlog(messages)
     written: list[int] = []
+    unpacked: list[int] = []
 
     class Watched(Vitals):
         def beat(self) -> None:
             super().beat()
             written.append(writer.messages)
+            unpacked.append(len(messages) - len(frames) - writer.messages + begun)
 
     bus = SimpleNamespace(
-        subscriber=lambda topic, depth: Backlog(messages if topic == "frame" else ()),
+        subscriber=lambda topic, depth: frames if topic == "frame" else Backlog(),
         publisher=lambda topic: SimpleNamespace(put=lambda record: None),
         on_alive=lambda tell: None,
     )
     writer = RecordingWriter(tmp_path / "late.mcap", about(configuration, {}), CAMERA, flush_ms=1e-6, sync=False)
     recorder = Recorder(configuration, bus, writer, Watched())  # type: ignore[arg-type]
-    written.clear()
+    begun = writer.messages  # the camera's drawing
     assert recorder.record_received(0.0)
     assert writer.messages >= 200
     assert max(np.diff(written)) <= 5
     assert writer.handed_bytes > 0
+    assert max(unpacked) <= 2  # a message, and the next of its topic
     writer.close(recorder.end())
     assert len([*Recording(tmp_path / "late.mcap").messages(("v1/frame",))]) == 200

@@ -17,8 +17,9 @@ LEAST_LEADER = 0.5  # probability of the ego's lane
 FARTHEST_M = 120.0
 BEND_SIGMA_PER_M = 0.002  # 1-sigma of a lane's curvature beyond where it was seen
 # The share of those who drive that comes towards the ego, where nothing has shown it yet: beside the ego's lane, and
-# beyond all that are known, where the other carriageway is as likely as a lane nobody has found
-AGAINST_BESIDE, AGAINST_BEYOND = 0.25, 0.6
+# beyond all that are known. By the labels of KITTI tracking 0000 to 0020, each car once at a side: 48 of 81 that are 2
+# to 5.5 m aside, 71 of 93 up to 15 m; both sides together, since nothing says on which one drives here
+AGAINST_BESIDE, AGAINST_BEYOND = 0.59, 0.76
 
 
 def with_users(lanes: Lanes, users: Sequence[UserInEgo], ego_mps: float, traffic: Traffic) -> Lanes:
@@ -30,7 +31,7 @@ def with_users(lanes: Lanes, users: Sequence[UserInEgo], ego_mps: float, traffic
     traffic.observe(near, between)
     shares = _shares(lanes.lanes, near)
     placed = [
-        (user, _placed(user, lanes.ego_index, share, 0.0 if user.walks else traffic.against(user, line)))
+        (user, _placed(user, lanes.ego_index, share, *traffic.shows(user, line)))
         for user, share, line in zip(near, shares, between, strict=True)
     ]
     ahead = [
@@ -46,8 +47,10 @@ def with_users(lanes: Lanes, users: Sequence[UserInEgo], ego_mps: float, traffic
     )
 
 
-def _placed(user: UserInEgo, index: int | None, shares: list[float], against: float | None) -> VehicleLane:
-    """`shares`: the probability of each lane, of which `index` is the ego's; `against`: that it comes towards us."""
+def _placed(
+    user: UserInEgo, index: int | None, shares: list[float], drives: float, against: float | None
+) -> VehicleLane:
+    """`shares`: the probability of each lane, of which `index` is the ego's; `drives`, `against`: as Traffic.shows."""
     total = sum(shares)
     if total > 1.0:  # neighbours' bounds need not meet
         shares = [share / total for share in shares]
@@ -56,7 +59,7 @@ def _placed(user: UserInEgo, index: int | None, shares: list[float], against: fl
     right = sum(shares[index + 1 :] if index is not None else (), 0.0)
     off = max(0.0, 1.0 - ego - left - right)
     beside, beyond = (AGAINST_BESIDE, AGAINST_BEYOND) if against is None else (against, against)
-    beside, beyond = beside * user.drives, beyond * user.drives
+    beside, beyond = beside * drives, beyond * drives
     # Who comes towards us drives on a road, also beyond the lanes that are known
     oncoming = beside * (left + right) + beyond * off
     left, right, off = (1.0 - beside) * left, (1.0 - beside) * right, (1.0 - beyond) * off
@@ -65,20 +68,23 @@ def _placed(user: UserInEgo, index: int | None, shares: list[float], against: fl
 
 
 def _shares(lanes: Sequence[Lane], users: Sequence[UserInEgo]) -> list[list[float]]:
-    """The probability that a user, known to its variance across, lies between a lane's bounds: for each user and lane.
+    """The probability that a user, known to its covariance, lies between a lane's bounds: for each user and lane.
 
+    Where a lane leads aside, an error ahead moves a user across it too; where it leads along the line of sight, none.
     All at once: there are as many pairs as users times lanes in each frame.
     """
-    rows = [(user.T_ego_vehicle.x_m, user.T_ego_vehicle.y_m, user.cov[1, 1]) for user in users]
-    x_m, y_m, variance = (column[:, None] for column in np.array(rows).reshape(-1, 3).T)  # (users, 1)
+    rows = [(u.T_ego_vehicle.x_m, u.T_ego_vehicle.y_m, u.cov[0, 0], u.cov[0, 1], u.cov[1, 1]) for u in users]
+    x_m, y_m, xx, xy, yy = (column[:, None] for column in np.array(rows).T)  # (users, 1)
     shapes = [(n.offset_m, n.slope, n.curvature_per_m, n.curvature_rate_per_m2) for n in lanes]
     curves, covs = np.array(shapes), np.array([lane.cov for lane in lanes]).reshape(-1, 4, 4)
     to_m, width_m, growth = np.array([(lane.to_m, lane.width_m, lane.width_slope) for lane in lanes]).T
     at_m = np.clip(x_m, 0.0, FARTHEST_M)
     known_m, beyond_m = np.minimum(at_m, to_m), np.maximum(at_m - to_m, 0.0)  # (users, lanes)
     at, bend = basis(known_m), 0.5 * BEND_SIGMA_PER_M * beyond_m * beyond_m
+    slope = (slope_basis(known_m) * curves).sum(axis=2)
+    variance = np.maximum(yy - slope * (2.0 * xy - slope * xx), 0.0)  # of the place across the lane: of y - slope x
     sigma = np.sqrt(variance + across_sigma_m(at, covs) ** 2 + bend * bend + 1e-6)
-    centre = (at * curves).sum(axis=2) + (slope_basis(known_m) * curves).sum(axis=2) * beyond_m
+    centre = (at * curves).sum(axis=2) + slope * beyond_m
     half = 0.5 * np.maximum(width_m + growth * known_m, 0.0)
     left, right = ((centre + half - y_m) / sigma).tolist(), ((centre - half - y_m) / sigma).tolist()
     return [

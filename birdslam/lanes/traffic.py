@@ -20,6 +20,8 @@ from birdslam.types import Lane, LaneLine, Lanes
 AGAINST = -0.3  # cosine of a direction to the ego's, below which traffic comes towards the ego
 EVIDENCE = 2.0  # log odds that one vehicle adds: one in eight turns, overtakes or is misjudged
 MOST = 6.0  # log odds
+# Log odds that one vehicle adds to whether those beyond a line drive, and their most: kerbs and lanes are side by side
+DRIVES_EVIDENCE, DRIVES_MOST = 1.0, 3.0
 BEYOND_SIGMAS = 2.0  # so surely beyond a line
 MEMORY_LINES = 64
 
@@ -29,45 +31,52 @@ class TrafficState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     log_odds: dict[int, float] = {}
     counted: list[tuple[int, int]] = []
+    drive_log_odds: dict[int, float] = {}
+    judged: list[tuple[int, int]] = []
 
 
 class Traffic:
-    """State: for each line the log odds that traffic beyond it, seen from the ego, comes towards the ego."""
+    """State: for each line the log odds that traffic beyond it, seen from the ego, comes towards the ego.
+
+    And by how much likelier those beyond it drive than is known of each alone: on a motorway's other carriageway nobody
+    stands, and beyond a kerb one that does is followed by others.
+    """
 
     def __init__(self, state: TrafficState = TrafficState()) -> None:  # noqa: B008
-        self._log_odds = dict(state.log_odds)
-        self._counted = dict.fromkeys(state.counted)  # (line, vehicle), in the order of counting
+        self._against = _Votes(state.log_odds, state.counted, EVIDENCE, MOST)
+        self._drive = _Votes(state.drive_log_odds, state.judged, DRIVES_EVIDENCE, DRIVES_MOST)
 
     def state(self) -> TrafficState:
         """As it stands between two frames."""
-        return TrafficState(dict(self._log_odds), list(self._counted))
+        against, drive = self._against, self._drive
+        return TrafficState(dict(against.log_odds), list(against.counted), dict(drive.log_odds), list(drive.counted))
 
     def observe(self, users: Sequence[UserInEgo], between: Sequence[LaneLine | None]) -> None:
         """What the road users of a frame show of the lines between them and the ego (`lines_between`)."""
         for user, line in zip(users, between, strict=True):
-            along = user.cos_along
-            if user.walks or along is None or abs(along) < -AGAINST:
+            if user.walks or line is None:
                 continue
-            if line is None or (line.line, user.vehicle) in self._counted:
-                continue
-            self._counted[line.line, user.vehicle] = None
-            odds = self._log_odds.pop(line.line, 0.0) + (EVIDENCE if along < 0.0 else -EVIDENCE)
-            self._log_odds[line.line] = min(max(odds, -MOST), MOST)
-        while len(self._log_odds) > MEMORY_LINES:
-            del self._log_odds[next(iter(self._log_odds))]
-        while len(self._counted) > MEMORY_LINES:
-            del self._counted[next(iter(self._counted))]
+            along, drives = user.cos_along, user.surely_drives
+            if along is not None and abs(along) >= -AGAINST:
+                self._against.add(line.line, user.vehicle, along < 0.0)
+            if drives is not None:
+                self._drive.add(line.line, user.vehicle, drives)
 
-    def against(self, user: UserInEgo, line: LaneLine | None) -> float | None:
-        """The probability that a road user moves against the ego's direction, were it to move; None: nothing shows.
+    def shows(self, user: UserInEgo, line: LaneLine | None) -> tuple[float, float | None]:
+        """The probabilities that a road user drives and that, were it to, it moves against the ego's direction.
 
-        `line` is the one between it and the ego's lane.
+        `line` is the one between it and the ego's lane. None: nothing shows a direction.
         """
-        along = user.cos_along
+        if user.walks:
+            return user.drives, 0.0
+        drives, along = user.drives, user.cos_along
+        more = 0.0 if line is None else self._drive.log_odds.get(line.line, 0.0)
+        if more:
+            drives = drives / (drives + (1.0 - drives) * math.exp(-more))
         if along is not None:
-            return 1.0 if along < AGAINST else 0.0
-        odds = None if line is None else self._log_odds.get(line.line)
-        return None if odds is None else 1.0 / (1.0 + math.exp(-odds))
+            return drives, 1.0 if along < AGAINST else 0.0
+        odds = None if line is None else self._against.log_odds.get(line.line)
+        return drives, None if odds is None else 1.0 / (1.0 + math.exp(-odds))
 
     def with_directions(self, lanes: Lanes) -> Lanes:
         """The lanes with the probability that their traffic is oncoming, where something showed it."""
@@ -84,10 +93,32 @@ class Traffic:
         outwards = range(k, ego) if k < ego else range(k, ego, -1)  # from lane k to the ego's
         for index in outwards:
             line = lanes.lanes[index].right if k < ego else lanes.lanes[index].left
-            if line is not None and line in self._log_odds:
-                odds = self._log_odds[line]
+            if line is not None and line in self._against.log_odds:
+                odds = self._against.log_odds[line]
                 return msgspec.structs.replace(lane, oncoming=1.0 / (1.0 + math.exp(-odds)))
         return lane
+
+
+class _Votes:
+    """Log odds of lines by the vehicles beyond them: a vehicle counts once at a line, with `evidence`, up to `most`."""
+
+    def __init__(
+        self, log_odds: dict[int, float], counted: Sequence[tuple[int, int]], evidence: float, most: float
+    ) -> None:
+        self.log_odds = dict(log_odds)
+        self.counted = dict.fromkeys(counted)  # (line, vehicle), in the order of counting
+        self._evidence, self._most = evidence, most
+
+    def add(self, line: int, vehicle: int, yes: bool) -> None:
+        if (line, vehicle) in self.counted:
+            return
+        self.counted[line, vehicle] = None
+        odds = self.log_odds.pop(line, 0.0) + (self._evidence if yes else -self._evidence)
+        self.log_odds[line] = min(max(odds, -self._most), self._most)
+        while len(self.log_odds) > MEMORY_LINES:
+            del self.log_odds[next(iter(self.log_odds))]
+        while len(self.counted) > MEMORY_LINES:
+            del self.counted[next(iter(self.counted))]
 
 
 def lines_between(lanes: Lanes, users: Sequence[UserInEgo]) -> list[LaneLine | None]:

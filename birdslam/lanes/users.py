@@ -13,6 +13,7 @@ from birdslam.types import FollowedPerson
 
 SLOW_MPS = 1.0  # below it a road user may stand, and a time gap is no number
 DRIVES_MPS = 3.0  # slower vehicles park, turn or cross
+STANDS = 0.9  # so probably it stands, as graph/standing.py decides
 KNOWN_YAW_RAD = 0.6  # 1-sigma of a direction
 MOVES_SIGMAS = 2.0  # so surely it drives
 
@@ -34,6 +35,13 @@ class UserInEgo:
     def drives(self) -> float:
         """The probability that it moves."""
         return 1.0 if abs(self.speed_mps) > SLOW_MPS else 1.0 - self.standing
+
+    @property
+    def surely_drives(self) -> bool | None:
+        """Whether it drives, where that is sure; None: nobody knows yet."""
+        if abs(self.speed_mps) >= max(DRIVES_MPS, MOVES_SIGMAS * self.speed_sigma_mps):
+            return True
+        return False if self.standing >= STANDS else None
 
     @property
     def cos_along(self) -> float | None:

@@ -28,6 +28,7 @@ COLUMNS = (
     *("latitude_deg", "longitude_deg", "yaw_from_east_rad", "earth_over_map"),
 )
 AROUND_FILES = (PLACES_FILE, ROAD_IN_MAP, *(f"{name}{suffix}" for name in ("road", "tracks") for suffix in SUFFIXES))
+MOST_TOGETHER = 50_000  # points of one feature
 SLACK_S = 5.0  # around the time in which something was seen, of the places that it may have been seen from
 
 
@@ -65,20 +66,11 @@ def write_around(directory: Path) -> list[str]:
         return []
     places = _Places(np.genfromtxt(rows, delimiter=",", ndmin=2))
     lines = list(_lines(directory / "map.geojson"))
-    features = [
-        {
-            "type": "Feature",
-            "geometry": {"type": "LineString", "coordinates": p.round(3).tolist()},
-            "properties": each.about,
-        }
-        for each in lines
-        for p in [places.in_map(each.points_m, each.epoch, *each.seen_s)]
-    ]
-    for kind, epoch, points in _points(directory / "map.csv"):
-        geometry = {"type": "MultiPoint", "coordinates": places.in_map(points, epoch).round(3).tolist()}
-        features.append({"type": "Feature", "geometry": geometry, "properties": {"kind": kind, "epoch": epoch}})
-    collection = {"type": "FeatureCollection", "birdslam": {"metres_of": "the map"}, "features": features}
-    (directory / ROAD_IN_MAP).write_bytes(msgspec.json.encode(collection) + b"\n")
+    with (directory / ROAD_IN_MAP).open("wb") as file:  # piece by piece: eight hours are millions of points
+        file.write(b'{"type":"FeatureCollection","birdslam":{"metres_of":"the map"},"features":[')
+        for number, feature in enumerate(_in_map(places, lines, directory / "map.csv")):
+            file.write(b"," * (number > 0) + msgspec.json.encode(feature))
+        file.write(b"]}\n")
     written = [ROAD_IN_MAP]
     if places.on_earth:
         road = [
@@ -95,6 +87,17 @@ def write_around(directory: Path) -> list[str]:
                 write_ways(directory / f"{name}{suffix}", ways)
             written.append(f"{name}.geojson")
     return written
+
+
+def _in_map(places: _Places, lines: Sequence[_Line], points: Path) -> Iterator[dict[str, object]]:
+    """The features of the road in the map's metres."""
+    for line in lines:
+        xy_m = places.in_map(line.points_m, line.epoch, *line.seen_s)
+        geometry = {"type": "LineString", "coordinates": xy_m.round(3).tolist()}
+        yield {"type": "Feature", "geometry": geometry, "properties": line.about}
+    for kind, epoch, points_m in _points(points):
+        geometry = {"type": "MultiPoint", "coordinates": places.in_map(points_m, epoch).round(3).tolist()}
+        yield {"type": "Feature", "geometry": geometry, "properties": {"kind": kind, "epoch": epoch}}
 
 
 @dataclass(frozen=True)
@@ -169,13 +172,16 @@ def _lines(path: Path) -> Iterator[_Line]:
 
 
 def _points(path: Path) -> Iterator[tuple[str, int, Floats]]:
-    """Points (N, 2) of map.csv, by kind and epoch."""
+    """Points (N, 2) of map.csv, by kind and epoch, so many at a time."""
     found: dict[tuple[str, int], list[tuple[float, float]]] = {}
     if path.is_file():
         with path.open(encoding="ascii", newline="") as file:
             for row in csv.DictReader(file):
                 key = row["kind"], int(row["epoch"])
-                found.setdefault(key, []).append((float(row["x_m"]), float(row["y_m"])))
+                points = found.setdefault(key, [])
+                points.append((float(row["x_m"]), float(row["y_m"])))
+                if len(points) == MOST_TOGETHER:
+                    yield *key, np.array(found.pop(key))
     for (kind, epoch), points in found.items():
         yield kind, epoch, np.array(points)
 

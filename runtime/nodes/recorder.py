@@ -38,6 +38,7 @@ from birdslam.sources.speed_log import added
 from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, SpeedReading, Status
 
 TURN_S = 0.05  # what has come is written at least so often
+TURN_MESSAGES = 256  # then it looks whether it is to end
 QUIET_S = 0.2  # at the end: nothing more has come for so long
 END_S = 2.0  # after END_OF_SOURCE, for the rest of the map
 HEALTH_NS = 1_000_000_000
@@ -73,6 +74,7 @@ class Recorder:
         health = (f"health/{name}" for name in (*NODES, MAP.name))
         others = (*(topic for topic in EXACT if topic != "estimate"), *health, "map_pose")
         self._others = {topic: bus.subscriber(topic, config.queue) for topic in others}
+        self._next: dict[str, Message] = {}  # of each topic, where one waits
         self._health = bus.publisher("health/record")
         self._events: deque[tuple[int, Alive]] = deque(maxlen=EVENTS)
         bus.on_alive(lambda node, alive: self._events.append((time.monotonic_ns(), Alive(node=node, alive=alive))))
@@ -99,20 +101,26 @@ class Recorder:
             self._draw(scene.from_camera(configuration.camera, time.time_ns()), time.monotonic_ns())
 
     def record_received(self, timeout_s: float) -> bool:
-        """Writes what has come; whether anything has."""
-        first = self._estimates.recv(timeout_s)
-        received = [("estimate", first)] if first else []
-        for topic, subscriber in (("estimate", self._estimates), *self._others.items()):
-            while (message := subscriber.recv(0.0)) is not None:
-                received.append((topic, message))
-                self._vitals.beat()  # each is decoded here
+        """Writes what has come, so many messages at the most; whether anything has.
+
+        In the order in which it came, with one message of each topic unpacked at a time: the rest waits as bytes.
+        """
+        if "estimate" not in self._next and (first := self._estimates.recv(timeout_s)) is not None:
+            self._next["estimate"] = first
         while self._events:
             t_ns, event = self._events.popleft()
             self._writer.draw("/alive", event, t_ns)
-        received.sort(key=lambda pair: pair[1].t_received_ns)
-        for topic, message in received:
-            self._take(topic, message)
+        written = 0
+        while written < TURN_MESSAGES:
+            for topic, subscriber in (("estimate", self._estimates), *self._others.items()):
+                if topic not in self._next and (message := subscriber.recv(0.0)) is not None:
+                    self._next[topic] = message
+            if not self._next:
+                break
+            oldest = min(self._next, key=lambda topic: self._next[topic].t_received_ns)
+            self._take(oldest, self._next.pop(oldest))
             self._show_life()
+            written += 1
         now_ns = time.monotonic_ns()
         if now_ns - self._reported_ns >= HEALTH_NS:
             self._report_health(now_ns)
@@ -120,10 +128,10 @@ class Recorder:
             self._begin_from_checkpoint(self._checkpoints, self._first_measured, now_ns)
         self._vitals.count(torn=self.torn, **self._counters())
         self._show_life()
-        return bool(received)
+        return written > 0
 
     def _show_life(self) -> None:
-        """After each message: what waited while it had no core takes seconds to write, and all of it is one turn."""
+        """After each message: those that waited while it had no core take long to write."""
         self._vitals.count(frames=self._writer.messages)
         self._vitals.beat()
         if self._writer.flush_if_due(time.monotonic_ns()):

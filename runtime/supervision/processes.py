@@ -136,12 +136,18 @@ class NodeProcess:
         self.vitals.close()
 
 
-def starved_s(pid: int) -> float:
-    """For which a process' main thread has been ready to run and waited for a core; 0 where Linux does not say."""
-    try:
-        return int(Path(f"/proc/{pid}/schedstat").read_text().split()[1]) / 1e9
-    except (OSError, IndexError):
-        return 0.0
+def waited_s(pid: int) -> dict[int, float]:
+    """For which each thread of a process has been ready to run and waited for a core; empty where Linux does not say.
+
+    All of them: a thread that waits for a core may hold the interpreter's lock, and the main thread then waits for it.
+    """
+    found = {}
+    for path in Path(f"/proc/{pid}/task").glob("*/schedstat"):
+        try:
+            found[int(path.parent.name)] = int(path.read_text().split()[1]) / 1e9
+        except (OSError, IndexError):  # it has just ended
+            continue
+    return found
 
 
 def _message(line: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +14,7 @@ import msgspec
 from birdslam.runtime.configuration import Configuration
 from birdslam.runtime.process import realtime
 from birdslam.runtime.process.restarts import Assignment, Restarts
-from birdslam.runtime.supervision.processes import NodeLog, NodeProcess, starved_s
+from birdslam.runtime.supervision.processes import NodeLog, NodeProcess, waited_s
 from birdslam.runtime.transport.presence import remove_socket, runtime_dir_of
 
 _SUMMED = ("frames", "dropped", "malformed", "torn", "coasted", "outrun", "speeds", "speeds_dropped")
@@ -66,16 +66,22 @@ class Intake:
 
 class Silence:
     """How long a loop beside the pipeline has shown no life: without the time for which it waited for a core, since all
-    others go first, and the next process would wait as long."""
+    others go first, and the next process would wait as long.
+
+    From one look to the next the thread that waited longest counts: the main thread, or one that held the interpreter's
+    lock. What is new at a look may have begun right after the last: so long ago where who looks waits for a core too.
+    """
 
     def __init__(self) -> None:
         self._beat_ns, self._starved_s = -1, 0.0
+        self._waited_s: Mapping[int, float] = {}
 
-    def own_s(self, beat_ns: int, silent_s: float, starved_s: float) -> float:
-        """`starved_s`: for which it has waited for a core since it began."""
-        if beat_ns != self._beat_ns:
-            self._beat_ns, self._starved_s = beat_ns, starved_s
-        return silent_s - (starved_s - self._starved_s)
+    def own_s(self, beat_ns: int, silent_s: float, waited_s: Mapping[int, float]) -> float:
+        """`waited_s`: for which each thread has waited for a core since it began."""
+        gained_s = max((s - self._waited_s.get(thread, s) for thread, s in waited_s.items()), default=0.0)
+        self._starved_s = gained_s + (self._starved_s if beat_ns == self._beat_ns else 0.0)
+        self._beat_ns, self._waited_s = beat_ns, waited_s
+        return silent_s - self._starved_s
 
 
 class Station:
@@ -176,7 +182,7 @@ class Station:
         self.was_ready = self.was_ready or process.ready
         silent_s = process.silent_s()
         if not self.duty.essential:
-            silent_s = self._silence.own_s(process.vitals["beat_ns"], silent_s, starved_s(process.pid))
+            silent_s = self._silence.own_s(process.vitals["beat_ns"], silent_s, waited_s(process.pid))
         if silent_s > limit_s:
             return f"is stalled: its loop has shown no life for {1e3 * limit_s:g} ms"
         if before is not None and process.ready:
@@ -185,9 +191,9 @@ class Station:
             missed = self._intake.missed(sent, taken, silent_s, now_s, limit_s)
             if missed:
                 return f"has taken in none of the last {missed} frames of {before.name}"
-        waited_s = now_s - process.begun_s
-        if not self.was_ready and waited_s > runtime.ready_timeout_s + runtime.stop_timeout_s:
-            return f"was not ready within {waited_s:.0f} s"
+        since_s = now_s - process.begun_s
+        if not self.was_ready and since_s > runtime.ready_timeout_s + runtime.stop_timeout_s:
+            return f"was not ready within {since_s:.0f} s"
         return ""
 
     def end(self, stall: str) -> None:

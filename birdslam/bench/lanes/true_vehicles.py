@@ -14,9 +14,14 @@ from birdslam.geometry.se2 import SE2
 from birdslam.sources.shipped_drive import TrueBody, TrueLine
 from birdslam.types import Estimate, VehicleLane
 
-MATCH_M, MATCH_REL = 2.0, 0.05  # from an estimated vehicle to its body, and so much more in a metre of distance
+# From an estimated vehicle to its body, and so much more in a metre of distance: a bearing is known to half a width, a
+# distance to a tenth or two. Alike in all directions, cars 40 m ahead stood for those of the next lane
+ALONG_M, ALONG_REL = 2.0, 0.15
+ACROSS_M, ACROSS_REL = 1.0, 0.02
+PEOPLE = ("pedestrian", "cyclist")  # bodies that are no vehicle's
 LEAST_PROBABILITY = 1e-3  # a certain error counts as so much in the log loss
 AGAINST_RAD = math.pi / 2
+DASHED = "dashed"  # of a true line's kinds
 PLACES = ("ego_lane", "left", "right", "oncoming", "off_road")
 
 
@@ -92,23 +97,33 @@ class VehicleScores:
 
 
 def _nearest(pose: SE2, bodies: Sequence[TrueBody]) -> TrueBody | None:
-    def distance_m(body: TrueBody) -> float:
-        return math.hypot(body.T_ego_body.x_m - pose.x_m, body.T_ego_body.y_m - pose.y_m)
+    """The vehicle in the direction of an estimated one, at about its distance; None where there is none."""
+    seen_m = math.hypot(pose.x_m, pose.y_m)
+    bearing_rad = math.atan2(pose.y_m, pose.x_m)
 
-    body = min(bodies, key=distance_m, default=None)
-    return body if body is not None and distance_m(body) < MATCH_M + MATCH_REL * abs(pose.x_m) else None
+    def away(body: TrueBody) -> float:
+        x, y = body.T_ego_body.x_m, body.T_ego_body.y_m
+        turn_rad = math.remainder(math.atan2(y, x) - bearing_rad, 2.0 * math.pi)
+        along = (math.hypot(x, y) - seen_m) / (ALONG_M + ALONG_REL * seen_m)
+        return math.hypot(along, turn_rad * seen_m / (ACROSS_M + ACROSS_REL * seen_m))
+
+    body = min((body for body in bodies if body.label not in PEOPLE), key=away, default=None)
+    return body if body is not None and away(body) < 1.0 else None
 
 
 def true_place(body: TrueBody, truth: tuple[TrueLine, ...]) -> str | None:
     """One of PLACES; None where the lines beside the body are not known."""
     x, y = body.T_ego_body.x_m, body.T_ego_body.y_m
     bounds = ego_bounds(truth, x)
-    here = [at for t in truth if (at := y_at(t, x)) is not None]
-    painted = [at for t in truth if t.kind != KERB and (at := y_at(t, x)) is not None]
+    here = sorted((at, t.kind) for t in truth if (at := y_at(t, x)) is not None)
+    painted = [k for k, (_, kind) in enumerate(here) if kind != KERB]
     if bounds is None or len(here) < 2 or not painted:
         return None
-    bounds_of_road = painted if len(painted) > 1 else here  # a street with a middle line ends at its kerbs
-    if not min(bounds_of_road) < y < max(bounds_of_road):
+    first, last = painted[0], painted[-1]
+    # Beyond its outermost lines is no road; but beyond a dashed one, or a street's only one, a lane up to the kerb
+    right, left = (len(painted) == 1 or here[k][1] == DASHED for k in (first, last))
+    first, last = max(first - right, 0), min(last + left, len(here) - 1)
+    if not here[first][0] < y < here[last][0]:
         return "off_road"
     if bounds[1] < y < bounds[0]:
         return "ego_lane"
