@@ -30,7 +30,7 @@ from birdslam.runtime.process.vitals import Vitals
 from birdslam.runtime.recording import scene
 from birdslam.runtime.recording.recording import EXACT, About, Alive, GraphCheckpoint, Latency, RecordingWriter
 from birdslam.runtime.topology import MAP, NODES, RECORDER
-from birdslam.runtime.transport.bus import Bus, Message
+from birdslam.runtime.transport.bus import Bus, Message, Subscriber
 from birdslam.runtime.transport.presence import ring_path
 from birdslam.runtime.transport.ring import FrameError, FrameReader
 from birdslam.runtime.wire import Health
@@ -110,15 +110,14 @@ class Recorder:
         while self._events:
             t_ns, event = self._events.popleft()
             self._writer.draw("/alive", event, t_ns)
+        subscribers = {"estimate": self._estimates, **self._others}
+        for topic in subscribers.keys() - self._next.keys():
+            self._unpack_next(topic, subscribers[topic])
         written = 0
-        while written < TURN_MESSAGES:
-            for topic, subscriber in (("estimate", self._estimates), *self._others.items()):
-                if topic not in self._next and (message := subscriber.recv(0.0)) is not None:
-                    self._next[topic] = message
-            if not self._next:
-                break
+        while self._next and written < TURN_MESSAGES:
             oldest = min(self._next, key=lambda topic: self._next[topic].t_received_ns)
             self._take(oldest, self._next.pop(oldest))
+            self._unpack_next(oldest, subscribers[oldest])
             self._show_life()
             written += 1
         now_ns = time.monotonic_ns()
@@ -129,6 +128,10 @@ class Recorder:
         self._vitals.count(torn=self.torn, **self._counters())
         self._show_life()
         return written > 0
+
+    def _unpack_next(self, topic: str, subscriber: Subscriber) -> None:
+        if (message := subscriber.recv(0.0)) is not None:
+            self._next[topic] = message
 
     def _show_life(self) -> None:
         """After each message: those that waited while it had no core take long to write."""
