@@ -163,6 +163,16 @@ def test_a_drive_without_places_has_nothing_beside_them(tmp_path: Path) -> None:
     assert write_around(tmp_path) == []
 
 
+def peak_bytes_around(folder: Path) -> int:
+    """The most that bringing what lies beside this drive into the map holds at once."""
+    tracemalloc.start()
+    try:
+        write_around(folder)
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
 def test_what_lies_beside_a_drive_takes_memory_as_the_drive_is_long(tmp_path: Path) -> None:
     """Points and places both grow with it; of all pairs of them, half an hour was 76 GB."""
 
@@ -175,12 +185,7 @@ def test_what_lies_beside_a_drive_takes_memory_as_the_drive_is_long(tmp_path: Pa
         (tmp_path / "map.csv").write_text("epoch,kind,x_m,y_m,lane\n" + rows)
         (tmp_path / "tracks").mkdir(exist_ok=True)
         (tmp_path / "tracks" / "3.tum.txt").write_text("".join(f"{t_s:.2f} {x_m} 2 0 0 0 0 1\n" for t_s, x_m in seen))
-        tracemalloc.start()
-        try:
-            write_around(tmp_path)
-            return tracemalloc.get_traced_memory()[1]
-        finally:
-            tracemalloc.stop()
+        return peak_bytes_around(tmp_path)
 
     peak_bytes(100)  # what is loaded once
     assert peak_bytes(2000) < 3.0 * peak_bytes(1000)
@@ -198,12 +203,7 @@ def test_points_of_a_long_drive_are_brought_into_the_map_so_many_at_a_time(
     def peak_bytes(points: int) -> int:
         rows = "".join(f"{k % 2},landmark,{k}.000,2.000,-1\n" for k in range(points))
         (tmp_path / "map.csv").write_text("epoch,kind,x_m,y_m,lane\n" + rows)
-        tracemalloc.start()
-        try:
-            write_around(tmp_path)
-            return tracemalloc.get_traced_memory()[1]
-        finally:
-            tracemalloc.stop()
+        return peak_bytes_around(tmp_path)
 
     peak_bytes(100)  # what is loaded once
     few = peak_bytes(4000)
