@@ -5,10 +5,6 @@ the shape of those that are known, and correlated with it, and a road's bend mov
 a car hides bends with its neighbours. The ego's motion moves the curves, so that paint seen at 10 m is map at 2 m
 later. An update solves for all of it and for the error of the camera's pitch in this image, which all points have in
 common, by iteratively reweighted least squares with the prediction as a prior.
-
-Over a crest or through a sag the road leaves the plane under the camera, and all lines of an image widen or narrow with
-the distance (Dickmanns and Mysliwetz 1992). That plane is the one that the road's image fits at some 11 m, so that the
-road's height over it is v x (x - 11 m) / 2: a pitch and a vertical curvature v that are nearly independent.
 """
 
 from __future__ import annotations
@@ -62,7 +58,12 @@ class Support:
 
 @dataclass(frozen=True)
 class Tilt:
-    """How the road of an image lies against the plane that its points were made with."""
+    """How the road of an image lies against the plane that its points were made with.
+
+    Over a crest or through a sag the road leaves that plane, and all lines of an image widen or narrow with the
+    distance (Dickmanns and Mysliwetz 1992). The plane is the one that the road's image fits at some PLANE_AT_M, so that
+    the road's height over it is v x (x - PLANE_AT_M) / 2: the pitch and the vertical curvature v hardly mix.
+    """
 
     pitch_rad: float = 0.0  # the camera's nose is lower by so much against the road at PLANE_AT_M
     vertical_per_m: float = 0.0  # vertical curvature; > 0: the road rises ahead
