@@ -186,7 +186,6 @@ GROUPS = (
             "slam.frontend.tracking.confirm_hits": "How often must a vehicle be seen to be reported?",
             "slam.graph.forget_s": "For how long is one reported that is out of sight?",
             "slam.graph.max_vehicles": "How many vehicles are reported at once?",
-            "slam.graph.drives_on": "On which side of the road does one drive? Who comes towards the car corrects it",
             "slam.frontend.localisation.max_range_m": "To which distance are vehicles placed?",
             "slam.frontend.localisation.vehicles.NAME.length_m": "How long are vehicles of a class in this country? A "
             "class that the table does not name is none; a file states all that it wants",
