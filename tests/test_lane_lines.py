@@ -370,6 +370,14 @@ def test_an_arrow_is_no_bound() -> None:
     assert row.ego == 1
 
 
+@pytest.mark.parametrize(("kerb_m", "bound"), [(-1.95, Bound.EDGE), (-1.55, Bound.PAINT)])
+def test_a_bright_kerbstone_past_the_roads_edge_is_no_bound(kerb_m: float, bound: Bound) -> None:
+    row = lane_row((line(1, 1.7), line(2, -1.75, LineKind.EDGE), line(3, kerb_m)))
+    assert row.ego == 0
+    assert row.lanes[0].right_bound is bound
+    assert row.lanes[0].right_m(0.0) == pytest.approx(-1.75 if bound is Bound.EDGE else kerb_m)
+
+
 def test_a_lane_with_one_line_is_completed_and_says_so() -> None:
     row = lane_row((line(1, 1.6),), usual_m=3.2, usual_sigma_m=0.2)
     assert row.ego == 0
