@@ -188,6 +188,22 @@ def test_lines_over_a_crest_and_through_a_sag(vertical_per_m: float) -> None:
     assert bends[-1] == pytest.approx(vertical_per_m, abs=4e-4)
 
 
+def test_a_direction_of_travel_that_is_off_for_long_does_not_drag_lines_along() -> None:
+    tracker, off, sigmas = LineTracker(CAMERA), [], []
+    for k in range(24):
+        true, told = SE2(2.5 * k, 0.0, 0.0), SE2(2.5 * k, 0.02 * 2.5 * k, 0.0)
+        image, masks = picture(true, (1.75, -1.75), (True, False))
+        # Nothing nearer than 8 m is in view
+        edge_px = np.array([[0.0, 168.0], [639.0, 168.0]])
+        tracker.update(told, CAMERA.ground, (0.003, 0.0), image, masks.above(edge_px), NOBODY, bonnet_px=edge_px)
+        for found in tracker.lines().at(told) if k >= 10 else ():
+            if found.kind is not LineKind.EDGE:
+                off.append(found.y_m(4.0) - math.copysign(1.75, found.offset_m))
+                sigmas.append(found.sigma_m(4.0))
+    assert abs(np.mean(off)) < 0.04
+    assert np.mean(np.abs(off) < 2.0 * np.array(sigmas)) > 0.9
+
+
 def test_a_line_is_drawn_on_the_road_as_far_as_a_crest_shows_it() -> None:
     crest, straight = -1.6e-3, line(0, 1.75)
     px = line_px(CAMERA, CAMERA.ground, straight, 5.0, crest)
@@ -352,6 +368,14 @@ def test_an_arrow_is_no_bound() -> None:
     row = lane_row((line(0, 5.2), line(1, 1.6), line(2, 0.0, existence=0.8), line(3, -1.8)))
     assert [(lane.left, lane.right) for lane in row.lanes] == [(0, 1), (1, 3)]
     assert row.ego == 1
+
+
+@pytest.mark.parametrize(("kerb_m", "bound"), [(-1.95, Bound.EDGE), (-1.55, Bound.PAINT)])
+def test_a_bright_kerbstone_past_the_roads_edge_is_no_bound(kerb_m: float, bound: Bound) -> None:
+    row = lane_row((line(1, 1.7), line(2, -1.75, LineKind.EDGE), line(3, kerb_m)))
+    assert row.ego == 0
+    assert row.lanes[0].right_bound is bound
+    assert row.lanes[0].right_m(0.0) == pytest.approx(-1.75 if bound is Bound.EDGE else kerb_m)
 
 
 def test_a_lane_with_one_line_is_completed_and_says_so() -> None:
