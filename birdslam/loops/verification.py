@@ -20,7 +20,7 @@ from birdslam.geometry.arrays import Bools, Floats, Ints
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import rotation_exp
 from birdslam.geometry.se2 import SE2
-from birdslam.loops.features import Features, hamming, match, match_near
+from birdslam.loops.features import Features, match, match_near
 from birdslam.loops.foot import body_pose, foot
 from birdslam.loops.keyframe import Keyframe
 from birdslam.loops.triangulation import cross
@@ -107,7 +107,7 @@ def locate(
     if len(features) < 8 or len(local.points_m) < 8:
         return None
     if guess is None:
-        pairs = match(hamming(local.descriptors, features.descriptors), MATCH_BITS, MATCH_RATIO)
+        pairs = match(local.descriptors, features.descriptors, MATCH_BITS, MATCH_RATIO)
         pose, pairs = _ransac(camera, features, local, pairs)
     else:
         pose = ego_pose(guess, Attitude())
