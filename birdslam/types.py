@@ -423,6 +423,8 @@ class Lanes(msgspec.Struct, frozen=True, kw_only=True):
     age_ns: Annotated[int, msgspec.Meta(ge=0)] = 0  # source time since the image that lines were last seen in
     tilt_rad: float = 0.0  # to be added to the pitch of `Ground`: so the lines of that image were parallel
     road_from_m: float = 0.0  # x from which that image shows the road: nearer is the image's edge, or the own bonnet
+    # Vertical curvature: the road ahead lies x^2 / 2 of it over the plane under the camera; > 0: it rises
+    vertical_curvature_per_m: float = 0.0
 
     @property
     def ego(self) -> Lane | None:

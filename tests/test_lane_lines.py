@@ -22,14 +22,16 @@ from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.lanes.curves import basis, moved
 from birdslam.lanes.ego_lane import EgoLane
+from birdslam.lanes.line_filter import PLANE_AT_M
 from birdslam.lanes.line_tracker import LineTracker, still_lines
 from birdslam.lanes.occupancy import with_users
-from birdslam.lanes.outline import lane_mask, lane_px
+from birdslam.lanes.outline import lane_mask, lane_px, line_px
 from birdslam.lanes.paint import RESOLVED_M, LinePoints, paint_points
 from birdslam.lanes.road_view import road_view
 from birdslam.lanes.topology import lane_row
 from birdslam.lanes.traffic import Traffic, TrafficState
 from birdslam.lanes.users import UserInEgo, person_in_ego
+from birdslam.outputs.drive_video import MOST_SCALE, MOST_WIDTH_PX, SideBySide
 from birdslam.outputs.line_map import LineMap
 from birdslam.perception import Segmentation
 from birdslam.runtime.configuration import Configuration
@@ -87,8 +89,12 @@ def picture(
     bend: float = 0.0,
     pitch_rad: float = 0.0,
     stripe_m: float = 0.14,
+    vertical_per_m: float = 0.0,
 ) -> tuple[np.ndarray, Segmentation]:
-    """A grey road between edges at +-8 m with lines along world's x, and what a network says of it."""
+    """A grey road between edges at +-8 m with lines along world's x, and what a network says of it.
+
+    It rises ahead of the ego by `vertical_per_m` x^2 / 2.
+    """
     ground = GroundPlane(CAMERA.height_m, pitch_rad)
     image = np.full((CAMERA.height_px, CAMERA.width_px), 150, np.uint8)
     road, lane = (np.zeros(image.shape, np.uint8) for _ in range(2))
@@ -100,7 +106,9 @@ def picture(
         left, right = (
             T_world_ego.inverse() @ np.column_stack([world_x, off + 0.5 * bend * world_x**2]) for off in (high_m, low_m)
         )
-        px = bev.ego_to_pixel(CAMERA, ground, np.vstack([left, right[::-1]]))
+        outline = np.vstack([left, right[::-1]])
+        rise_m = 0.5 * vertical_per_m * outline[:, 0] ** 2
+        px = bev.ego_to_pixel(CAMERA, ground, np.column_stack([outline, rise_m]))
         if np.isfinite(px).all():
             for plane, value in planes:
                 cv2.fillPoly(plane, [np.round(px * 16).astype(np.int32)], value, shift=4)
@@ -161,6 +169,38 @@ def test_ids_last_and_dashes_are_told_from_a_solid_line() -> None:
             assert abs(line.y_m(truth[0]) - truth[1]) < max(0.1, 3.0 * line.sigma_m(10.0))
 
 
+@pytest.mark.parametrize("vertical_per_m", [-1.6e-3, 0.0, 1.6e-3])
+def test_lines_over_a_crest_and_through_a_sag(vertical_per_m: float) -> None:
+    # The ground is what the road's image fits some 11 m ahead, as odometry gives it
+    ground = GroundPlane(CAMERA.height_m, 0.5 * vertical_per_m * PLANE_AT_M)
+    tracker, off, sigmas, bends = LineTracker(CAMERA), [], [], []
+    for k in range(20):
+        pose = SE2(2.0 * k, 0.0, 0.0)
+        image, masks = picture(pose, (5.2, 1.75, -1.75), (False, True, False), vertical_per_m=vertical_per_m)
+        tracker.update(pose, ground, (0.003, 0.0), image, masks, NOBODY)
+        for found in tracker.lines().at(pose) if k >= 6 else ():
+            if found.kind is not LineKind.EDGE:
+                off.append(found.y_m(28.0) - min((5.2, 1.75, -1.75), key=lambda y: abs(found.y_m(8.0) - y)))
+                sigmas.append(found.sigma_m(28.0))
+        bends.append(tracker.lines().tilt.vertical_per_m)
+    assert np.median(np.abs(off)) < 0.15
+    assert np.mean(np.abs(off) < 2.0 * np.array(sigmas)) > 0.9
+    assert bends[-1] == pytest.approx(vertical_per_m, abs=4e-4)
+
+
+def test_a_line_is_drawn_on_the_road_as_far_as_a_crest_shows_it() -> None:
+    crest, straight = -1.6e-3, line(0, 1.75)
+    px = line_px(CAMERA, CAMERA.ground, straight, 5.0, crest)
+    touches_m = math.sqrt(2.0 * CAMERA.height_m / -crest)
+    assert straight.to_m > touches_m
+    x_m = np.arange(5.0, touches_m, 0.5)
+    truth = bev.ego_to_pixel(
+        CAMERA, CAMERA.ground, np.column_stack([x_m, np.full(len(x_m), 1.75), 0.5 * crest * x_m**2])
+    )
+    np.testing.assert_allclose(px, truth)
+    assert np.all(np.diff(px[:, 1]) < 0.0)
+
+
 @pytest.mark.parametrize(("aside_m", "turned_rad"), [(0.0, 0.2), (1.5, -0.2), (1.6, 0.0)])
 def test_lines_that_the_paint_does_not_lie_on_are_looked_for_anew(aside_m: float, turned_rad: float) -> None:
     tracker, pose = LineTracker(CAMERA), SE2()
@@ -189,7 +229,7 @@ def test_what_a_bonnet_mirrors_is_no_line_and_the_lane_is_not_drawn_over_it() ->
         tracker.update(SE2(), CAMERA.ground, (0.003, 0.0), image, seen, NOBODY, bonnet_px=bonnet_px)
         lines = tracker.lines()
         found[bonnet_px is None] = [y for y in (line.y_m(5.0) for line in lines.at(SE2())) if abs(y) < 1.0]
-        lanes = EgoLane().lanes(lines.at(SE2()), 0, 0.0, lines.road_from_m)
+        lanes = EgoLane().lanes(lines.at(SE2()), 0, road_from_m=lines.road_from_m)
     assert found[True]
     assert not found[False]
     assert lanes.ego is not None
@@ -295,7 +335,7 @@ def test_noise_and_jumps_end_nothing() -> None:
         )
         tracker.update(pose, CAMERA.ground, (0.003, 0.0), image, masks, NOBODY)
         lines = tracker.lines().at(pose @ SE2(0.5, 0.0, 0.02))
-        lanes = EgoLane().lanes(lines, 0, tracker.tilt_rad)
+        lanes = EgoLane().lanes(lines, 0, tracker.tilt)
         assert msgspec.json.decode(msgspec.json.encode(lanes), type=Lanes) == lanes
         assert all(lane.width_m > 0.0 for lane in lanes.lanes)
 
@@ -335,7 +375,7 @@ def test_a_lane_change_is_one_event() -> None:
     changes = []
     for k in range(40):
         y_m = -0.1 * k  # the ego moves left by 0.1 m a frame
-        lanes = keeper.lanes((line(0, 5.2 + y_m), line(1, 1.7 + y_m), line(2, -1.8 + y_m)), 0, 0.0)
+        lanes = keeper.lanes((line(0, 5.2 + y_m), line(1, 1.7 + y_m), line(2, -1.8 + y_m)), 0)
         changes.append(lanes.change)
         assert lanes.ego is not None
     assert changes.count(LaneChange.LEFT) == 1
@@ -345,14 +385,14 @@ def test_a_lane_change_is_one_event() -> None:
 
 @given(st.floats(3.0, 60.0), st.floats(-12.0, 12.0), st.floats(0.0, 4.0), st.floats(-3.1, 3.1))
 def test_places_of_a_vehicle_sum_to_one(x_m: float, y_m: float, sigma_m: float, yaw_rad: float) -> None:
-    lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0, 0.0)
+    lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0)
     vehicle = UserInEgo(7, SE2(x_m, y_m, yaw_rad), np.eye(3) * sigma_m**2, 4.0, 8.0)
     (place,) = with_users(lanes, [vehicle], 10.0, Traffic()).vehicles
     assert place.ego_lane + place.left + place.right + place.oncoming + place.off_road == pytest.approx(1.0)
 
 
 def test_the_leader_is_the_nearest_in_the_egos_lane() -> None:
-    lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0, 0.0)
+    lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0)
     cov = np.diag([0.25, 0.01, 0.001])
     cars = [
         UserInEgo(k, SE2(x, y, 0.0), cov, 4.0, 8.0) for k, x, y in ((1, 30.0, 0.1), (2, 12.0, 3.4), (3, 20.0, -0.3))
@@ -375,7 +415,7 @@ def crowd(count: int) -> list[UserInEgo]:
 
 
 def test_places_are_by_the_lanes_own_bounds_and_sigmas() -> None:
-    lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0, 0.0)
+    lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0)
     users = crowd(30)
     for user, place in zip(users, with_users(lanes, users, 10.0, Traffic()).vehicles, strict=True):
         own, x, y = lanes.ego, user.T_ego_vehicle.x_m, user.T_ego_vehicle.y_m
@@ -390,7 +430,7 @@ def test_places_are_by_the_lanes_own_bounds_and_sigmas() -> None:
 
 def test_a_further_road_user_costs_few_calls() -> None:
     """All are placed at once; one by one, lane by lane and line by line it was half of the optimizer's step."""
-    lanes = EgoLane().lanes(tuple(line(k, 8.7 - 3.5 * k) for k in range(6)), 0, 0.0)
+    lanes = EgoLane().lanes(tuple(line(k, 8.7 - 3.5 * k) for k in range(6)), 0)
 
     def calls_for(count: int) -> int:
         users, calls = crowd(count), [0]
@@ -420,7 +460,7 @@ def test_curves_move_together_as_each_alone() -> None:
 
 
 def test_who_walks_is_in_a_lane_and_leads_nobody_who_cycles_does() -> None:
-    lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0, 0.0)
+    lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0)
     walker = FollowedPerson(person=5, x_m=9.0, y_m=-0.5, cov=(0.2, 0.0, 0.0, 0.05), vx_mps=-1.4, vy_mps=0.0,
                             velocity_cov=(0.1, 0.0, 0.0, 0.1))  # fmt: skip
     cyclist = msgspec.structs.replace(walker, person=6, x_m=25.0, vx_mps=4.0, label="cyclist")
@@ -433,7 +473,7 @@ def test_who_walks_is_in_a_lane_and_leads_nobody_who_cycles_does() -> None:
 
 def test_a_lane_that_leads_along_the_line_of_sight_needs_no_distance() -> None:
     leads_aside = msgspec.structs.replace(line(0, 1.75), slope=0.2), msgspec.structs.replace(line(1, -1.75), slope=0.2)
-    lanes = EgoLane().lanes(leads_aside, 0, 0.0)
+    lanes = EgoLane().lanes(leads_aside, 0)
     far = np.array([6.0, 1.2, 0.0])  # the distance is off by 6 m, and with it the place aside
     on_sight = UserInEgo(1, SE2(30.0, 6.0, 0.0), np.outer(far, far), 4.0, 8.0)
     ahead = UserInEgo(2, SE2(30.0, 6.0, 0.0), np.diag([36.0, 0.01, 0.01]), 4.0, 8.0)
@@ -445,7 +485,7 @@ def test_a_lane_that_leads_along_the_line_of_sight_needs_no_distance() -> None:
 
 
 def test_beyond_a_line_where_others_drove_who_is_new_drives_too() -> None:
-    lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0, 0.0)
+    lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0)
     cov = np.diag([1.0, 0.04, 0.01])
     new = UserInEgo(9, SE2(40.0, 12.0, math.pi), cov, 4.0, 0.0, 8.0, standing=0.7)
 
@@ -481,7 +521,7 @@ def test_a_vehicle_stands_for_the_body_in_its_direction() -> None:
     """A tenth too near, the leader stood for the car of the lane beside, which is nearer to it in metres."""
     truth = tuple(true_line(k, "dashed", y) for k, y in enumerate((5.4, 1.8, -1.8, -5.4)))
     bodies = body(1, 60.0, 0.0), body(2, 56.0, -3.6), body(3, 54.0, 2.0, label="pedestrian", mps=1.0)
-    lanes = EgoLane().lanes((line(0, 1.8), line(1, -1.8)), 0, 0.0)
+    lanes = EgoLane().lanes((line(0, 1.8), line(1, -1.8)), 0)
     lanes = with_users(
         lanes, [UserInEgo(7, SE2(54.5, -0.2, 0.0), np.diag([16.0, 0.02, 0.01]), 4.0, 14.0)], 14.0, Traffic()
     )
@@ -518,7 +558,7 @@ def test_the_lane_between_the_last_dashes_and_the_kerb_is_on_the_road() -> None:
 
 
 def test_traffic_tells_which_way_a_lane_runs() -> None:
-    lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0, 0.0)
+    lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0)
     cov = np.diag([1.0, 0.04, 0.01])
     unknown = UserInEgo(9, SE2(40.0, 3.4, 0.0), np.diag([1.0, 0.04, 3.0]), 4.0, 2.0)
     traffic = Traffic()
@@ -560,6 +600,29 @@ def test_a_lane_that_merges_says_where_it_ends() -> None:
     assert (narrow.splits_m, wide.ends_m, straight.ends_m, straight.splits_m) == (None,) * 4
 
 
+def test_lines_are_drawn_behind_who_stands_on_the_road() -> None:
+    lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.75), line(2, -1.75)), 0)
+    car = VehicleEstimate(
+        vehicle=3, T_world_vehicle=SE2(14.0, 1.75, 0.0), cov=(0.0,) * 9, velocity_mps=(0.0, 0.0),
+        velocity_cov=(0.0,) * 4, age_ns=0, frames=1, length_m=4.0, width_m=1.8, height_m=1.5,
+    )  # fmt: skip
+    estimate = Estimate(
+        epoch=0, frame_id=0, t_source_ns=0, t_capture_ns=0, t_utc_ns=0, T_world_ego=SE2(), cov=(0.0,) * 9, valid=True,
+        vehicles=(car,), lanes=lanes,
+    )  # fmt: skip
+    image = np.full((CAMERA.height_px, CAMERA.width_px, 3), 90, np.uint8)
+    with_lines = SideBySide(CAMERA).draw(image, estimate, [], [])
+    without = SideBySide(CAMERA).draw(image, msgspec.structs.replace(estimate, lanes=None), [], [])
+    scale = min(MOST_SCALE, MOST_WIDTH_PX / CAMERA.width_px)
+    on_car, before_it = (
+        np.rint((bev.ego_to_pixel(CAMERA, CAMERA.ground, np.array([at]))[0] + 0.5) * scale - 0.5).astype(int)
+        for at in ((18.0, 1.75), (9.0, 1.75))
+    )
+    changed = (with_lines != without).any(axis=2)
+    assert changed[before_it[1] - 2 : before_it[1] + 3, before_it[0] - 2 : before_it[0] + 3].any()
+    assert not changed[on_car[1] - 2 : on_car[1] + 3, on_car[0] - 2 : on_car[0] + 3].any()
+
+
 def test_the_map_has_each_line_once(tmp_path: Path) -> None:
     path = tmp_path / "map.geojson"
     lines = LineMap(path)
@@ -582,7 +645,7 @@ def test_the_map_has_each_line_once(tmp_path: Path) -> None:
 
 
 def test_foxglove_draws_lines_where_they_are() -> None:
-    lanes = EgoLane().lanes((line(4, 1.75), line(5, -1.75, LineKind.EDGE)), 0, 0.0)
+    lanes = EgoLane().lanes((line(4, 1.75), line(5, -1.75, LineKind.EDGE)), 0)
     estimate = Estimate(
         epoch=0, frame_id=0, t_source_ns=0, t_capture_ns=0, t_utc_ns=0, T_world_ego=SE2(5.0, 1.0, 0.3), cov=(0.0,) * 9,
         valid=True, lanes=lanes,
@@ -601,7 +664,7 @@ def test_the_scores_of_known_errors() -> None:
     truth = tuple(TrueLine(k, "solid", np.column_stack([x, np.full(len(x), y)])) for k, y in enumerate((1.75, -1.75)))
     scores, keeper = LineScores(), EgoLane()
     for k in range(10):
-        scores.add(0.1 * k, keeper.lanes((line(0, 1.85), line(1, -1.65), line(2, 7.9)), 0, 0.0), truth)
+        scores.add(0.1 * k, keeper.lanes((line(0, 1.85), line(1, -1.65), line(2, 7.9)), 0), truth)
     report = scores.report("toy", 100.0)
     assert report.ranges[1].error_median_m == pytest.approx(0.1)
     assert report.ranges[1].bias_m == pytest.approx(0.1)
@@ -613,7 +676,7 @@ def test_the_scores_of_known_errors() -> None:
 
 
 def test_the_overlap_of_a_lane_with_its_mask() -> None:
-    lanes = EgoLane().lanes((line(1, 1.75), line(2, -1.75)), 0, 0.0)
+    lanes = EgoLane().lanes((line(1, 1.75), line(2, -1.75)), 0)
     assert lanes.ego is not None
     area = lane_mask(CAMERA, CAMERA.ground, lanes.ego)
     mask = np.zeros((*area.shape, 3), np.uint8)

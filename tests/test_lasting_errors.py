@@ -94,13 +94,16 @@ def test_the_lower_edge_of_a_vehicle_is_never_learned_from_itself() -> None:
     assert spread[-1] == pytest.approx(spread[50], rel=0.1)
 
 
-def test_a_parked_car_whose_box_becomes_its_neighbours_still_stands() -> None:
+@pytest.mark.parametrize("leap_m", [(4.5,), (3.0,), (2.2, 4.5)])
+def test_a_parked_car_whose_box_becomes_its_neighbours_still_stands(leap_m: tuple[float, ...]) -> None:
+    """Whether it leaps by a car's length at once, by less, or a box of both lies between."""
     ground_size = GroundSizeFilter(CAMERA, CONFIG)
     tracker = Tracker(CAMERA, TrackingConfig(), LOCALISATION, ground_size, PseudoLidarConfig())
     standing = []
     for k in range(30):
         ground_size.predict(DT_S, 0.0, None, None, 0.8)
-        x_m = 44.0 - 0.8 * k + (0.0 if k < 12 else 4.5)  # the next one in the row
+        leapt_m = 0.0 if k < 12 else leap_m[min(k - 12, len(leap_m) - 1)]  # to the next one in the row
+        x_m = 44.0 - 0.8 * k + leapt_m
         box = box_of(x_m, 3.8, CAMERA.ground, CAR.height_m)[None]
         frame = EgoFrame(k, round(k * DT_S * 1e9), SE2(0.8 * k, 0.0, 0.0), np.diag([1e-4, 1e-4, 1e-8]))
         tracker.follow(frame, observe_boxes(box, np.ones(1), ("car",), CAMERA, ground_size.ground, LOCALISATION))

@@ -108,7 +108,7 @@ def test_a_parked_car_that_a_tree_hides_in_part_still_stands() -> None:
     assert standing > 0.5
     assert outlier[0] > 0.9
     assert outlier[1] < 0.05
-    unaware, _ = drive_past(ParallaxConfig(side_outlier=0.0, another=1e-12), hidden=0.4)
+    unaware, _ = drive_past(ParallaxConfig(side_outlier=0.0, own_for_s=1e12), hidden=0.4)
     assert unaware < standing
 
 

@@ -138,6 +138,7 @@ _LANES = Lanes(
     age_ns=100_000_000,
     tilt_rad=0.00390625,
     road_from_m=4.5,
+    vertical_curvature_per_m=-0.001953125,
 )
 # Every field holds something else than its default.
 EXAMPLES: tuple[msgspec.Struct, ...] = (

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import math
 
+from birdslam.lanes.line_filter import Tilt
 from birdslam.lanes.topology import WIDTH_M, WIDTH_SIGMA_M, lane_row
 from birdslam.types import Bound, Lane, LaneChange, LaneLine, Lanes, LineKind
 
 CROSSED_M = 0.3  # past the line the ego has changed lanes
 WIDTH_GAIN = 0.05  # of a frame's width, in the running mean
+LEVEL = Tilt()
 LEAST_SIGMA_M = 0.15  # lanes of one road differ by so much
 
 
@@ -27,7 +29,7 @@ class EgoLane:
         self._width_m, self._sigma_m = WIDTH_M, WIDTH_SIGMA_M
         self._sides: dict[int, float] = {}  # line -> its side when it was last far enough: +1 left, -1 right
 
-    def lanes(self, lines: tuple[LaneLine, ...], age_ns: int, tilt_rad: float, road_from_m: float = 0.0) -> Lanes:
+    def lanes(self, lines: tuple[LaneLine, ...], age_ns: int, tilt: Tilt = LEVEL, road_from_m: float = 0.0) -> Lanes:
         """The lanes between the lines (of a moment, in ego), and whether the ego has just changed."""
         row = lane_row(lines, self._width_m, self._sigma_m)
         own = None if row.ego is None else row.lanes[row.ego]
@@ -38,7 +40,8 @@ class EgoLane:
             ego_index=row.ego,
             change=self._changed(lines),
             age_ns=age_ns,
-            tilt_rad=tilt_rad,
+            tilt_rad=tilt.tangent_rad,
+            vertical_curvature_per_m=tilt.vertical_per_m,
             road_from_m=road_from_m,
         )
 

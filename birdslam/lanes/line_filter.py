@@ -1,10 +1,10 @@
 """The joint Kalman filter of a road's lines: cubics in the ego's frame that share what a road's lines share.
 
-State: the curves (a, h, c, d) of all lines, with one covariance. A line is born with the shape of those that are known,
-and correlated with it, and a road's bend moves all of them together: so a line that a car hides bends with its
-neighbours. The ego's motion moves the curves, so that paint seen at 10 m is map at 2 m later. An update solves for all
-curves and for the error of the camera's pitch in this image, which all points have in common, by iteratively reweighted
-least squares with the prediction as a prior.
+State: the road's vertical curvature and the curves (a, h, c, d) of all lines, with one covariance. A line is born with
+the shape of those that are known, and correlated with it, and a road's bend moves all of them together: so a line that
+a car hides bends with its neighbours. The ego's motion moves the curves, so that paint seen at 10 m is map at 2 m
+later. An update solves for all of it and for the error of the camera's pitch in this image, which all points have in
+common, by iteratively reweighted least squares with the prediction as a prior.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Ids = Ints
 # Prior of a road's shape in an image without a past: heading, curvature, its rate, beside what the search has found
 SIGMA_SHAPE = np.array([0.0, 0.03, 0.004, 2e-4])
 # ... and of one line against the others
-SIGMA_OWN = np.array([0.2, 0.04, 2e-3, 3e-5])
+SIGMA_OWN = np.array([0.2, 0.04, 5e-4, 1e-5])
 SIGMA_OWN_EDGE = np.array([0.3, 0.02, 5e-4, 1e-5])  # of a road's edge: a mask's border wanders more than the road's
 # Random walks in a metre of travel, of all lines together and of each
 WALK_SHAPE = np.array([0.0, 0.0, 2e-4, 4e-5])
@@ -39,6 +39,10 @@ INDEPENDENT_M = 6.0  # images of the same paint err alike: so much travel makes 
 GATE_SIGMAS, LEAST_GATE_M, WIDEST_GATE_M = 3.0, 0.25, 0.7
 KERNEL_SIGMAS = 2.0  # Cauchy
 ITERATIONS = 4
+# Vertical curvature of roads: the tightest crest of a road for 50 km/h has a radius of 700 m, and lasts some 50 m
+SIGMA_VERTICAL_PER_M, VERTICAL_MEMORY_M = 1e-3, 50.0
+LEAST_FALL = 0.3  # of a level road's: beyond it lies what a crest hides
+PLANE_AT_M = 11.0  # where the ground under the camera is measured: the middle of the road that odometry looks at
 FARTHEST_M, STEEPEST = 40.0, 2.0  # of a line's offset and slope: what is beyond has got lost
 _CELLS = 1 << 16  # bins of one line, for keys
 _JITTER = 1e-9  # of a correlation
@@ -52,19 +56,42 @@ class Support:
     points: Ids
 
 
+@dataclass(frozen=True)
+class Tilt:
+    """How the road of an image lies against the plane that its points were made with.
+
+    Over a crest or through a sag the road leaves that plane, and all lines of an image widen or narrow with the
+    distance (Dickmanns and Mysliwetz 1992). The plane is the one that the road's image fits at some PLANE_AT_M, so that
+    the road's height over it is v x (x - PLANE_AT_M) / 2: the pitch and the vertical curvature v hardly mix.
+    """
+
+    pitch_rad: float = 0.0  # the camera's nose is lower by so much against the road at PLANE_AT_M
+    vertical_per_m: float = 0.0  # vertical curvature; > 0: the road rises ahead
+
+    @property
+    def tangent_rad(self) -> float:
+        """The same of the road under the camera."""
+        return self.pitch_rad - 0.5 * self.vertical_per_m * PLANE_AT_M
+
+    def applied(self, x_m: Floats, y_m: Floats, height_m: float) -> tuple[Floats, Floats]:
+        """Where points of the plane lie on the road."""
+        return tilted(x_m, y_m, height_m, self.tangent_rad, self.vertical_per_m)
+
+
 class LineFilter:
-    """The curves' means (n, 4) and their covariance (4 n, 4 n)."""
+    """The curves' means (n, 4), the vertical curvature, and the covariance (1 + 4 n, 1 + 4 n) of it and of them."""
 
     def __init__(self) -> None:
         self.curves: Floats = np.zeros((0, 4))
-        self.cov: Floats = np.zeros((0, 0))
+        self.vertical_per_m = 0.0
+        self.cov: Floats = np.full((1, 1), SIGMA_VERTICAL_PER_M**2)
 
     def __len__(self) -> int:
         return len(self.curves)
 
     def block(self, k: int) -> Floats:
         """(4, 4) covariance of one curve."""
-        part = slice(4 * k, 4 * k + 4)
+        part = slice(1 + 4 * k, 5 + 4 * k)
         return self.cov[part, part]
 
     def begin(self, offsets_m: Floats, headings: Floats, curvature_per_m: float, edges: Bools) -> None:
@@ -72,23 +99,28 @@ class LineFilter:
         count = len(offsets_m)
         self.curves = np.zeros((count, 4))
         self.curves[:, 0], self.curves[:, 1], self.curves[:, 2] = offsets_m, headings, curvature_per_m
-        self.cov = _together(SIGMA_SHAPE**2, np.zeros(4), count)
-        self.cov += np.diag(np.where(edges[:, None], SIGMA_OWN_EDGE, SIGMA_OWN).ravel() ** 2)
+        self.vertical_per_m = 0.0
+        self.cov = np.zeros((1 + 4 * count, 1 + 4 * count))
+        self.cov[0, 0] = SIGMA_VERTICAL_PER_M**2
+        self.cov[1:, 1:] = _together(SIGMA_SHAPE**2, np.zeros(4), count)
+        self.cov[1:, 1:] += np.diag(np.where(edges[:, None], SIGMA_OWN_EDGE, SIGMA_OWN).ravel() ** 2)
 
     def add(self, offset_m: float, heading: float, like: int, edge: bool) -> None:
         """A further line, with the bend of the line `like`."""
         count = len(self.curves)
         curve = self.curves[like].copy()
         curve[0], curve[1] = offset_m, heading
-        rows = np.vstack([np.eye(4 * count), np.eye(4 * count)[4 * like : 4 * like + 4]])
-        rows[4 * count, :] = 0.0  # its offset is its own
+        size = 1 + 4 * count
+        rows = np.vstack([np.eye(size), np.eye(size)[1 + 4 * like : 5 + 4 * like]])
+        rows[size, :] = 0.0  # its offset is its own
         self.cov = rows @ self.cov @ rows.T
-        self.cov[4 * count :, 4 * count :] += np.diag((SIGMA_OWN_EDGE if edge else SIGMA_OWN) ** 2)
+        self.cov[size:, size:] += np.diag((SIGMA_OWN_EDGE if edge else SIGMA_OWN) ** 2)
         self.curves = np.vstack([self.curves, curve])
 
     def keep(self, kept: Ids) -> None:
         """Drops the other lines."""
-        rows = (4 * np.asarray(kept, dtype=np.int64)[:, None] + np.arange(4)).ravel()
+        lines = 1 + 4 * np.asarray(kept, dtype=np.int64)[:, None] + np.arange(4)
+        rows = np.concatenate([[0], lines.ravel()])
         self.curves, self.cov = self.curves[kept], self.cov[np.ix_(rows, rows)]
 
     def predict(self, T_old_new: SE2) -> None:
@@ -97,16 +129,20 @@ class LineFilter:
         if not count:
             return
         step_m = float(np.hypot(T_old_new.x_m, T_old_new.y_m))
-        J = np.zeros((4 * count, 4 * count))
-        keep = np.exp(-step_m / RATE_MEMORY_M)
-        sideways = np.tile([-1.0, 0.0, 0.0, 0.0], count)
-        turned = np.tile([0.0, -1.0, 0.0, 0.0], count)
+        J = np.zeros((1 + 4 * count, 1 + 4 * count))
+        sideways = np.concatenate([[0.0], np.tile([-1.0, 0.0, 0.0, 0.0], count)])
+        turned = np.concatenate([[0.0], np.tile([0.0, -1.0, 0.0, 0.0], count)])
         self.curves, blocks = moved(self.curves, T_old_new)
         for k, block in enumerate(blocks):
-            J[4 * k : 4 * k + 4, 4 * k : 4 * k + 4] = block
-        J[3::4] *= keep
+            J[1 + 4 * k : 5 + 4 * k, 1 + 4 * k : 5 + 4 * k] = block
+        keep, remains = np.exp(-step_m / RATE_MEMORY_M), np.exp(-step_m / VERTICAL_MEMORY_M)
+        J[4::4] *= keep
         self.curves[:, 3] *= keep
-        self.cov = J @ self.cov @ J.T + _together(WALK_SHAPE**2 * step_m, WALK_OWN**2 * step_m, count)
+        J[0, 0] = remains
+        self.vertical_per_m *= remains
+        self.cov = J @ self.cov @ J.T
+        self.cov[0, 0] += (1.0 - remains**2) * SIGMA_VERTICAL_PER_M**2
+        self.cov[1:, 1:] += _together(WALK_SHAPE**2 * step_m, WALK_OWN**2 * step_m, count)
         self.cov += np.outer(sideways, sideways) * STEP_SIGMA_M**2 * step_m
         self.cov += np.outer(turned, turned) * STEP_SIGMA_RAD**2 * step_m
 
@@ -132,29 +168,34 @@ class LineFilter:
         sigma_tilt_rad: float,
         travelled_m: float,
         first_tilt_rad: float = 0.0,
-    ) -> tuple[list[Support], float]:
+        level: bool = False,
+    ) -> tuple[list[Support], Tilt]:
         """Lines by the points of their own class: `of` (N,) that of the points, `classes` (n,) that of the lines.
 
-        Returns what was seen of each line, and the tilt of the camera against the pitch that the points were made with.
+        Returns what was seen of each line, and the road's tilt against the plane that the points were made with. The
+        road's edges (classes above 0) are no witness of it: a mask's border narrows and widens for its own reasons.
+        `level`: of an image whose pitch nobody has measured, which can't tell it from the road's bend, the road is
+        taken for a plane, and edges are better than nothing.
         """
         count = len(self.curves)
-        size = 4 * count + 1
-        prior = np.zeros((size, size))
+        prior = np.zeros((4 * count + 2, 4 * count + 2))
         scale = np.sqrt(self.cov.diagonal())  # metres beside 1e-5 / m^2: inverted as correlations
-        correlated = self.cov / np.outer(scale, scale) + _JITTER * np.eye(4 * count)
+        correlated = self.cov / np.outer(scale, scale) + _JITTER * np.eye(len(scale))
         prior[:-1, :-1] = np.linalg.inv(correlated) / np.outer(scale, scale)
         prior[-1, -1] = 1.0 / max(sigma_tilt_rad, 1e-5) ** 2
-        mean = np.concatenate([self.curves.ravel(), [0.0]])
+        mean = np.concatenate([[self.vertical_per_m], self.curves.ravel(), [0.0]])
         state = mean.copy()
         state[-1] = first_tilt_rad  # the curves of an image without a past are those of this tilt
         information, owner = prior, np.zeros(0, np.int64)
         x = points.x_m
         inflation = max(1.0, INDEPENDENT_M / max(travelled_m, 0.5))
         for _ in range(ITERATIONS):
-            curves, tilt = state[:-1].reshape(count, 4), float(state[-1])
-            x, y = tilted(points.x_m, points.y_m, height_m, tilt)
+            curves, tilt = state[1:-1].reshape(count, 4), Tilt(float(state[-1]), float(state[0]))
+            x, y = tilt.applied(points.x_m, points.y_m, height_m)
             owner = self._owners(x, y, points, curves, of, classes)
-            H, r, variance = _bins(x, y, points, owner, curves, height_m)
+            witness = (classes == 0) | level
+            H, r, variance = _bins(x, y, points, owner, curves, witness, _fall(x, height_m, tilt.vertical_per_m))
+            H[:, 0] *= not level
             robust = 1.0 / (1.0 + r**2 / variance / KERNEL_SIGMAS**2)
             scaled = H * (robust / (variance * inflation))[:, None]
             information = prior + scaled.T @ H
@@ -162,9 +203,9 @@ class LineFilter:
         cells = np.floor(x / BIN_M).astype(np.int64)
         seen = [Support(np.unique(cells[owner == k]), np.flatnonzero(owner == k)) for k in range(count)]
         cov = np.linalg.inv(information)
-        self.curves = state[:-1].reshape(count, 4)
+        self.vertical_per_m, self.curves = float(state[0]), state[1:-1].reshape(count, 4)
         self.cov = 0.5 * (cov + cov.T)[:-1, :-1]
-        return seen, float(state[-1])
+        return seen, Tilt(float(state[-1]), self.vertical_per_m)
 
     def _owners(self, x: Floats, y: Floats, points: LinePoints, curves: Floats, of: Ids, classes: Ids) -> Ints:
         """(N,) the line that each point is on, -1: none. Of two ridges of a row one alone is the line.
@@ -188,10 +229,20 @@ class LineFilter:
         return out
 
 
+def _fall(x_m: Floats, height_m: float, vertical_per_m: float) -> Floats:
+    """(N,) how steeply a ray from the camera meets the road at x (N,): at a crest's far end it touches."""
+    level = height_m / x_m
+    out: Floats = np.maximum(level + 0.5 * vertical_per_m * x_m, LEAST_FALL * level)
+    return out
+
+
 def _bins(
-    x: Floats, y: Floats, points: LinePoints, owner: Ids, curves: Floats, height_m: float
+    x: Floats, y: Floats, points: LinePoints, owner: Ids, curves: Floats, witness: Bools, fall: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """The observations, one for a metre of a line: H (B, 4 n + 1), residuals (B,) and variances (B,)."""
+    """The observations, one for a metre of a line: H (B, 4 n + 2), residuals (B,) and variances (B,).
+
+    `witness` (n,) are the lines that say how the road lies, `fall` (N,) is how steeply the points' rays meet it.
+    """
     on = np.flatnonzero(owner >= 0)
     line, x, y, sigma = owner[on], x[on], y[on], points.sigma_m[on]
     key, index = np.unique(line * _CELLS + np.floor(x / BIN_M).astype(np.int64) % _CELLS, return_inverse=True)
@@ -201,13 +252,13 @@ def _bins(
     at, curve = basis(x), curves[line]
     residual = y - (at * curve).sum(axis=1)
     slope = (slope_basis(x) * curve).sum(axis=1)
-    by_tilt = (slope * x - y) * x / height_m
+    by_tilt = np.where(witness[line], (slope * x - y) / fall[on], 0.0)
     x_bin, r, tilt = (np.bincount(index, weight * value, len(key)) / total for value in (x, residual, by_tilt))
     variance = np.bincount(index, sigma**2, len(key)) / counts / np.minimum(counts, MOST_IN_BIN) + SIGMA_BIN_M**2
-    H = np.zeros((len(key), 4 * len(curves) + 1))
-    column = 4 * (key // _CELLS)
+    H = np.zeros((len(key), 4 * len(curves) + 2))
+    column = 1 + 4 * (key // _CELLS)
     H[np.arange(len(key))[:, None], column[:, None] + np.arange(4)] = basis(x_bin)
-    H[:, -1] = -tilt
+    H[:, 0], H[:, -1] = -0.5 * tilt * (x_bin - PLANE_AT_M), -tilt
     return H, r, variance
 
 

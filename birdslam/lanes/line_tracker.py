@@ -17,7 +17,7 @@ from birdslam.geometry.arrays import Floats, Ints
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.lanes.curves import basis
-from birdslam.lanes.line_filter import LineFilter, Support
+from birdslam.lanes.line_filter import LineFilter, Support, Tilt
 from birdslam.lanes.paint import LinePoints, double_share, edge_points, paint_points
 from birdslam.lanes.parallel_search import SEARCHED_M, Peak, Shape, find_lines, find_shape
 from birdslam.lanes.road_view import RoadView, nearest_m, road_view
@@ -66,7 +66,7 @@ class LineTracker:
         self._tracks: list[Track] = []
         self._T_world_filter: SE2 | None = None
         self._standing = 0
-        self.tilt_rad = 0.0  # of the last image against its pitch
+        self.tilt = Tilt()  # of the road in the last image against its ground
         self._road_from_m = 0.0
         self._height_m, self._sigma_roll_rad = self.camera.height_m, self.camera.tilt_sigma_rad  # of the last image
 
@@ -103,14 +103,14 @@ class LineTracker:
             first_tilt_rad = self._begin(shape, found)
         if not len(self._filter):
             return
-        points, of, seen = self._correct(view, paint, sigma_pitch_rad, travelled_m, first_tilt_rad)
+        points, of, seen = self._correct(view, paint, sigma_pitch_rad, travelled_m, first_tilt_rad, search_tilt)
         if self._is_lost(paint, seen):
             self._give_way()
             shape, found = self._search(view, paint, 0.0)
             before = _explained_m(paint, self._tracks, seen)
             if sum(peak.evidence_m for kind, peak in found if kind == PAINT) > BETTER * before:
                 self._begin(shape, found)
-                points, of, seen = self._correct(view, paint, sigma_pitch_rad, AFRESH_M, 0.0)
+                points, of, seen = self._correct(view, paint, sigma_pitch_rad, AFRESH_M, 0.0, search_tilt)
         if not self._filter.sound().all():
             self._keep_sound()
             return
@@ -182,13 +182,19 @@ class LineTracker:
         return shape.tilt_rad
 
     def _correct(
-        self, view: RoadView, paint: LinePoints, sigma_pitch_rad: float, travelled_m: float, first_tilt_rad: float
+        self,
+        view: RoadView,
+        paint: LinePoints,
+        sigma_pitch_rad: float,
+        travelled_m: float,
+        first_tilt_rad: float,
+        level: bool,
     ) -> tuple[LinePoints, Ints, list[Support]]:
         """Corrects the filter by one image: its points, the class of each, and what was seen of each line."""
         points, of = self._with_edges(view, paint)
         classes = np.array([track.kind for track in self._tracks])
-        seen, self.tilt_rad = self._filter.update(
-            points, of, classes, self._height_m, sigma_pitch_rad, travelled_m, first_tilt_rad
+        seen, self.tilt = self._filter.update(
+            points, of, classes, self._height_m, sigma_pitch_rad, travelled_m, first_tilt_rad, level
         )
         return points, of, seen
 
@@ -213,7 +219,9 @@ class LineTracker:
         """Which lines were seen, over which range, how much of them is paint."""
         for k, (track, support) in enumerate(zip(self._tracks, seen, strict=True)):
             x = view.x_m
-            y = basis(x) @ self._filter.curves[k]
+            # Where the line is in the view, which is of a plane
+            on_road_m, _ = self.tilt.applied(x, np.zeros(len(x)), self._height_m)
+            y = (basis(on_road_m) @ self._filter.curves[k]) * x / on_road_m
             column = np.round((y - view.y_m[0]) / (view.y_m[1] - view.y_m[0])).astype(np.int64)
             inside = (column >= 0) & (column < len(view.y_m))
             at = np.clip(column, 0, len(view.y_m) - 1)
@@ -267,7 +275,7 @@ class LineTracker:
         like = self._reference()
         curve = self._filter.curves[like]
         at = basis(np.array([10.0]))[0]
-        turned = points.tilted(height_m, self.tilt_rad)
+        turned = points.tilted(height_m, self.tilt.tangent_rad, self.tilt.vertical_per_m)
         for kind, least_m in ((PAINT, LEAST_PAINT_M), (LEFT_EDGE, LEAST_EDGE_M), (RIGHT_EDGE, LEAST_EDGE_M)):
             if kind != PAINT and any(track.kind == kind for track in self._tracks):
                 continue
@@ -310,7 +318,7 @@ class LineTracker:
             tuple(msgspec.structs.replace(self._tracks[k]) for k in sure),
             self._filter.curves[sure].copy(),
             np.array([self._filter.block(k) for k in sure]).reshape(-1, 4, 4),
-            self.tilt_rad,
+            self.tilt,
             self._height_m,
             self._sigma_roll_rad,
             self._road_from_m,
@@ -335,5 +343,5 @@ def still_lines(
     """The lines of a single image, and the ground under its camera with the pitch that makes them parallel."""
     tracker = LineTracker(camera, certain_m=LEAST_PAINT_M)  # there will be no other
     tracker.update(SE2(), camera.ground, (camera.tilt_sigma_rad,) * 2, image, segmentation, boxes_px, search_tilt=True)
-    ground = GroundPlane(camera.height_m, camera.pitch_rad + tracker.tilt_rad, camera.roll_rad)
+    ground = GroundPlane(camera.height_m, camera.pitch_rad + tracker.tilt.pitch_rad, camera.roll_rad)
     return tracker.lines().at(SE2()), ground

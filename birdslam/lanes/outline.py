@@ -1,6 +1,11 @@
-"""A lane in the image: the outline of its area, and a line as a polyline."""
+"""A lane in the image: the outline of its area, and a line as a polyline.
+
+`vertical_per_m` is the road's vertical curvature over the ground (`Lanes.vertical_curvature_per_m`).
+"""
 
 from __future__ import annotations
+
+import math
 
 import cv2
 import numpy as np
@@ -16,17 +21,21 @@ _FAR_PX = 20_000.0  # OpenCV draws no farther
 _CLOSE_PX = 9  # gaps of a mask that are closed: its border to paint, and noise
 
 
-def line_px(camera: Camera, ground: GroundPlane, line: LaneLine, from_m: float = FROM_M) -> Floats:
-    """(N, 2) pixels of a line from `from_m` to where it is known."""
-    x_m = np.arange(from_m, line.to_m, STEP_M)
-    return _px(camera, ground, x_m, np.array([line.y_m(x) for x in x_m.tolist()]))
+def line_px(
+    camera: Camera, ground: GroundPlane, line: LaneLine, from_m: float = FROM_M, vertical_per_m: float = 0.0
+) -> Floats:
+    """(N, 2) pixels of a line from `from_m` to where it is known, or a crest hides it."""
+    x_m = _along(ground, from_m, line.to_m, vertical_per_m)
+    return _px(camera, ground, x_m, np.array([line.y_m(x) for x in x_m.tolist()]), vertical_per_m)
 
 
-def lane_px(camera: Camera, ground: GroundPlane, lane: Lane, from_m: float = FROM_M) -> Floats:
+def lane_px(
+    camera: Camera, ground: GroundPlane, lane: Lane, from_m: float = FROM_M, vertical_per_m: float = 0.0
+) -> Floats:
     """(N, 2) pixels of the polygon around a lane from `from_m`, along its left bound and back along its right one."""
-    x_m = np.arange(from_m, lane.to_m, STEP_M)
-    left = _px(camera, ground, x_m, np.array([lane.left_m(x) for x in x_m.tolist()]))
-    right = _px(camera, ground, x_m, np.array([lane.right_m(x) for x in x_m.tolist()]))
+    x_m = _along(ground, from_m, lane.to_m, vertical_per_m)
+    left = _px(camera, ground, x_m, np.array([lane.left_m(x) for x in x_m.tolist()]), vertical_per_m)
+    right = _px(camera, ground, x_m, np.array([lane.right_m(x) for x in x_m.tolist()]), vertical_per_m)
     return np.vstack([left, right[::-1]])
 
 
@@ -47,7 +56,13 @@ def visible(area: Bools, segmentation: Segmentation) -> Bools:
     return out
 
 
-def _px(camera: Camera, ground: GroundPlane, x_m: Floats, y_m: Floats) -> Floats:
-    px = bev.ego_to_pixel(camera, ground, np.column_stack([x_m, y_m]))
+def _along(ground: GroundPlane, from_m: float, to_m: float, vertical_per_m: float) -> Floats:
+    """Distances along a line, up to where the sight touches a crest."""
+    touches_m = math.sqrt(2.0 * ground.height_m / -vertical_per_m) if vertical_per_m < 0.0 else math.inf
+    return np.arange(from_m, min(to_m, touches_m), STEP_M)
+
+
+def _px(camera: Camera, ground: GroundPlane, x_m: Floats, y_m: Floats, vertical_per_m: float) -> Floats:
+    px = bev.ego_to_pixel(camera, ground, np.column_stack([x_m, y_m, 0.5 * vertical_per_m * x_m * x_m]))
     out: Floats = np.clip(px[np.isfinite(px).all(axis=1)], -_FAR_PX, _FAR_PX)
     return out

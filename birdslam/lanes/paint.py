@@ -68,9 +68,9 @@ class LinePoints:
         fields = (self.x_m, self.y_m, self.sigma_m, self.weight, self.masked, self.yellow)
         return LinePoints(*(field[chosen] for field in fields))  # type: ignore[arg-type]
 
-    def tilted(self, height_m: float, by_rad: float) -> LinePoints:
-        """The points if the camera's nose is lower by `by_rad`."""
-        x_m, y_m = tilted(self.x_m, self.y_m, height_m, by_rad)
+    def tilted(self, height_m: float, by_rad: float, vertical_per_m: float = 0.0) -> LinePoints:
+        """The points if the camera's nose is lower by `by_rad`, on a road of that vertical curvature."""
+        x_m, y_m = tilted(self.x_m, self.y_m, height_m, by_rad, vertical_per_m)
         return replace(self, x_m=x_m, y_m=y_m)
 
 

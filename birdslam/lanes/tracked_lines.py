@@ -11,7 +11,7 @@ import numpy as np
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.lanes.curves import across_sigma_m, basis, moved
-from birdslam.lanes.line_filter import FARTHEST_M, STEEPEST
+from birdslam.lanes.line_filter import FARTHEST_M, STEEPEST, Tilt
 from birdslam.types import LaneLine, LineColour, LineKind
 
 PAINT, LEFT_EDGE, RIGHT_EDGE = 0, 1, 2  # classes of lines: each is seen by points of its own
@@ -54,7 +54,7 @@ class TrackedLines:
     tracks: tuple[Track, ...]
     curves: Floats
     covs: Floats
-    tilt_rad: float  # of their image against its pitch
+    tilt: Tilt  # of the road in their image against its ground
     height_m: float  # of its camera
     sigma_roll_rad: float  # of its ground
     road_from_m: float  # where the road straight ahead begins to be in its view

@@ -208,7 +208,7 @@ class LaneMapper:
             return None
         seen_ns, lines = self._lines
         age_ns = max(0, t_source_ns - seen_ns)
-        return self._ego_lane.lanes(lines.at(T_world_ego), age_ns, lines.tilt_rad, lines.road_from_m)
+        return self._ego_lane.lanes(lines.at(T_world_ego), age_ns, lines.tilt, lines.road_from_m)
 
     def _take_result(self) -> _LaneResult | None:
         """The result of a run that has ended."""

@@ -106,8 +106,7 @@ class SideBySide:
         ground = self._camera.ground
         if estimate.ground is not None:
             ground = GroundPlane(estimate.ground.height_m, estimate.ground.pitch_rad, estimate.ground.roll_rad)
-        if estimate.lanes is not None:
-            self._draw_lanes(view, ground, estimate.lanes)
+        solids: list[tuple[RoadUser, Floats, Floats]] = []  # with its foot in ego, and its eight corners in pixels
         for vehicle in estimate.road_users:
             if not vehicle.in_sight:
                 continue
@@ -118,6 +117,15 @@ class SideBySide:
             if corners[:, 0].min() < 1.0:  # reaches behind the image plane
                 continue
             px = (bev.ego_to_pixel(self._camera, ground, corners) + 0.5) * self._scale - 0.5
+            solids.append((vehicle, foot, px))
+        if estimate.lanes is not None:
+            before = view.copy()
+            self._draw_lanes(view, ground, estimate.lanes)
+            in_front = np.zeros(view.shape[:2], np.uint8)  # what stands on the road hides the road behind it
+            for _, _, px in solids:
+                cv2.fillConvexPoly(in_front, cv2.convexHull(_fixed(px)), 1, cv2.LINE_8, SHIFT)
+            np.copyto(view, before, where=in_front[:, :, None] > 0)
+        for vehicle, foot, px in solids:
             low, high = _fixed(px[:4]), _fixed(px[4:])
             colour = _colour_of(vehicle)
             cv2.polylines(view, [low, high], True, colour, 1, cv2.LINE_AA, SHIFT)
@@ -132,14 +140,15 @@ class SideBySide:
         """The ego's lane as a shade, and the lines, not over the bonnet: paint, and dimmer the road's edges."""
         from_m = max(lanes.road_from_m, FROM_M)
         ground = GroundPlane(ground.height_m, ground.pitch_rad + lanes.tilt_rad, ground.roll_rad)
+        bend = lanes.vertical_curvature_per_m
         if lanes.ego is not None:
-            area = (lane_px(self._camera, ground, lanes.ego, from_m) + 0.5) * self._scale - 0.5
+            area = (lane_px(self._camera, ground, lanes.ego, from_m, bend) + 0.5) * self._scale - 0.5
             shade = view.copy()
             if len(area) > 2:
                 cv2.fillPoly(shade, [_fixed(area)], _bgr(EGO), cv2.LINE_AA, SHIFT)
             cv2.addWeighted(shade, LANE_ALPHA, view, 1.0 - LANE_ALPHA, 0.0, view)
         for line in lanes.lines:
-            px = (line_px(self._camera, ground, line, from_m) + 0.5) * self._scale - 0.5
+            px = (line_px(self._camera, ground, line, from_m, bend) + 0.5) * self._scale - 0.5
             colour = _bgr(FAINT if line.kind is LineKind.EDGE else LINE)
             cv2.polylines(view, [_fixed(px)], False, colour, 2, cv2.LINE_AA, SHIFT)
 

@@ -16,17 +16,19 @@ from birdslam.vehicles.state.parallax_measurements import VX, VY
 
 Floats = NDArray[np.float64]
 
-# UNUSUAL stands too, and is of no usual size; STARTED stood when first seen, and has such a one's size and place
-MODES = STANDING, UNUSUAL, STARTED, CREEPING, DRIVING, CROSSING = range(6)
+# UNUSUAL stands too, and is of no usual size; so does ANOTHER: its boxes are those of the neighbour of the vehicle that
+# the track was of. STARTED stood when first seen, and has such a one's size and place
+MODES = STANDING, UNUSUAL, ANOTHER, STARTED, CREEPING, DRIVING, CROSSING = range(7)
 STATIONARY, MOVING = [STANDING, UNUSUAL], [STARTED, CREEPING, DRIVING, CROSSING]
-WITHOUT_GROUND = [6, 7]  # STATIONARY again, without the cue GROUND
+WITHOUT_GROUND = [7, 8]  # STATIONARY again, without the cue GROUND
+_AT_REST = slice(STANDING, ANOTHER + 1)
 FILTERS = len(MODES) + len(WITHOUT_GROUND)
 
 
 def birth_weights(config: ParallaxConfig) -> Floats:
     """(MODES,): how probably a vehicle that is seen for the first time is in each mode."""
     driving = 1.0 - config.standing - config.unusual - config.creeping - config.crossing
-    return np.array([config.standing, config.unusual, 0.0, config.creeping, driving, config.crossing])
+    return np.array([config.standing, config.unusual, 0.0, 0.0, config.creeping, driving, config.crossing])
 
 
 def birth_velocity_cov(config: ParallaxConfig, heading_rad: Floats, on_road: bool) -> dict[int, Floats]:
@@ -41,11 +43,13 @@ def birth_velocity_cov(config: ParallaxConfig, heading_rad: Floats, on_road: boo
 
 def transitions(config: ParallaxConfig, dt_s: float) -> Floats:
     """(MODES, MODES), from and to: how often vehicles change their mode within `dt_s`."""
-    starts, changes, slows = (
-        1.0 - math.exp(-dt_s / time_s) for time_s in (config.stands_for_s, config.creeps_for_s, config.drives_for_s)
-    )
+    times_s = config.stands_for_s, config.creeps_for_s, config.drives_for_s, config.own_for_s, config.another_for_s
+    starts, changes, slows, leaps, settles = (1.0 - math.exp(-dt_s / time_s) for time_s in times_s)
     share = np.eye(len(MODES))
-    share[STATIONARY, STATIONARY], share[STATIONARY, STARTED] = 1.0 - starts, starts
+    share[STATIONARY, STATIONARY] = (1.0 - starts) * (1.0 - leaps)
+    share[STATIONARY, STARTED], share[STATIONARY, ANOTHER] = starts, (1.0 - starts) * leaps
+    share[ANOTHER, ANOTHER], share[ANOTHER, STANDING] = (1.0 - starts) * (1.0 - settles), (1.0 - starts) * settles
+    share[ANOTHER, STARTED] = starts
     for slow in (STARTED, CREEPING):
         share[slow, slow], share[slow, STANDING] = 1.0 - changes / 2.0, changes / 2.0
     share[CREEPING, CREEPING], share[CREEPING, DRIVING] = 1.0 - changes, changes / 2.0
@@ -54,14 +58,20 @@ def transitions(config: ParallaxConfig, dt_s: float) -> Floats:
     return share
 
 
-def mix(config: ParallaxConfig, dt_s: float, weight: Floats, x: Floats, P: Floats) -> tuple[Floats, Floats, Floats]:
-    """Weights (N, MODES), states (N, FILTERS, 8) and covariances after the changes of mode within `dt_s`."""
+def mix(
+    config: ParallaxConfig, dt_s: float, weight: Floats, x: Floats, P: Floats, leap: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Weights (N, MODES), states (N, FILTERS, 8) and covariances after the changes of mode within `dt_s`.
+
+    `leap` (N, 8, 8) is the covariance of a neighbour's state about a vehicle's own.
+    """
     joint = weight[:, :, None] * transitions(config, dt_s)
     after = joint.sum(axis=1)
     share = joint / after[:, None]
-    modes, without_ground = list(MODES), WITHOUT_GROUND + MOVING
+    modes, without_ground = list(MODES), [*WITHOUT_GROUND, ANOTHER, *MOVING]
     mixed_x, mixed_P = x.copy(), P.copy()
     mixed_x[:, modes], mixed_P[:, modes] = _mixed(config, share, x[:, modes], P[:, modes])
+    mixed_P[:, ANOTHER] += share[:, STATIONARY, ANOTHER].sum(axis=1)[:, None, None] * leap
     mixed_x[:, WITHOUT_GROUND], mixed_P[:, WITHOUT_GROUND] = _mixed(
         config, share[..., STATIONARY], x[:, without_ground], P[:, without_ground]
     )
@@ -69,17 +79,17 @@ def mix(config: ParallaxConfig, dt_s: float, weight: Floats, x: Floats, P: Float
 
 
 def _mixed(config: ParallaxConfig, share: Floats, x: Floats, P: Floats) -> tuple[Floats, Floats]:
-    """The moments of filters (N, 6) mixed by `share` (N, 6, K); of the six and of the K the first two stand."""
-    P[:, STATIONARY, [[VX], [VY]], [[VX], [VY]]] = config.sigma_creep_mps**2  # when it starts
+    """The moments of filters (N, 7) mixed by `share` (N, 7, K); of the seven, and of the K, the first three stand."""
+    P[:, _AT_REST, [[VX], [VY]], [[VX], [VY]]] = config.sigma_creep_mps**2  # when it starts
     to = share.swapaxes(1, 2)  # (N, to, from)
     mean = to @ x
     gap = x[:, None] - mean[:, :, None]  # (N, to, from, 8)
     cov = (to @ P.reshape(*P.shape[:2], -1)).reshape(*mean.shape, P.shape[-1])
     cov += (to[..., None] * gap).swapaxes(-1, -2) @ gap
     speed = slice(VX, VY + 1)
-    mean[:, STATIONARY, speed] = 0.0
-    cov[:, STATIONARY, speed] = 0.0
-    cov[:, STATIONARY, :, speed] = 0.0
+    mean[:, _AT_REST, speed] = 0.0
+    cov[:, _AT_REST, speed] = 0.0
+    cov[:, _AT_REST, :, speed] = 0.0
     return mean, cov
 
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.se2 import SE2
 from birdslam.vehicles.state.motion_modes import (
+    ANOTHER,
     FILTERS,
     MODES,
     MOVING,
@@ -87,7 +88,6 @@ class Parallax:
 
     def __init__(self, config: ParallaxConfig) -> None:
         self.config = config
-        self._another_var = config.sigma_another_size_rel**2
         self._prior_weight = np.maximum(birth_weights(config), MIN_WEIGHT)
         self._x = np.zeros((0, FILTERS, len(STATES)))
         self._P = np.zeros((0, FILTERS, len(STATES), len(STATES)))
@@ -104,7 +104,7 @@ class Parallax:
     def standing(self, row: int) -> float:
         """The probability that a vehicle stands."""
         weight = self._weight[row]
-        return float(weight[STANDING] + weight[UNUSUAL])
+        return float(weight[STANDING] + weight[UNUSUAL] + weight[ANOTHER])
 
     def begin(
         self,
@@ -149,7 +149,8 @@ class Parallax:
         if not len(self._x) or dt_s <= 0.0:
             return
         config = self.config
-        self._weight, self._x, self._P = mix(config, dt_s, self._weight, self._x, self._P)
+        leap = self._leaps(T_world_ego)
+        self._weight, self._x, self._P = mix(config, dt_s, self._weight, self._x, self._P, leap)
         keep = math.exp(-dt_s / config.tilt_memory_s)
         self._x[..., TILT] *= keep
         self._P[..., TILT, :] *= keep
@@ -166,6 +167,15 @@ class Parallax:
             J[..., :2, :2] = T_world_ego.rotation()
             J[..., 0, 2], J[..., 1, 2] = -at[..., 1], at[..., 0]
             self._P[..., :2, :2] += J @ ego_cov @ J.swapaxes(-1, -2)
+
+    def _leaps(self, T_world_ego: SE2) -> Floats:
+        """(N, 8, 8) the covariance of the state of a vehicle's neighbour, in a row of parked ones, about its own."""
+        config = self.config
+        along = config.sigma_another_rel * (self._x[:, STANDING, :VX] - [T_world_ego.x_m, T_world_ego.y_m])
+        out = np.zeros((len(along), len(STATES), len(STATES)))
+        out[:, :VX, :VX] = along[:, :, None] * along[:, None, :] + config.sigma_another_m**2 * np.eye(2)
+        out[:, [HEIGHT, WIDTH], [HEIGHT, WIDTH]] = config.sigma_another_size_rel**2
+        return out
 
     def learn_sizes(
         self, rows: Sequence[int], boxes: ParallaxMeasurements, T_world_ego: SE2, height_m: float
@@ -192,16 +202,10 @@ class Parallax:
         shift = side_outlier_shift(boxes, innovation, config.sigma_side_outlier_rel * np.sqrt(of_box))
         share = np.minimum(config.side_outlier + self._side_outlier[rows], MAX_SIDE_OUTLIER).T
         after = update_with_side_outliers(P, PJt, S, innovation, shift, share)
-        changed = self._with_another(P, J, S, noise, innovation, boxes, T_world_ego, after.log_likelihood)
-        if changed.any():
-            PJt = P @ J.swapaxes(-1, -2)
-            S = J @ PJt + noise
-            after = update_with_side_outliers(P, PJt, S, innovation, shift, share)
         self._x[rows] = x + after.step
         self._P[rows] = after.cov
 
         log_likelihood = after.log_likelihood[:, : len(MODES)]
-        log_likelihood[changed[:, : len(MODES)]] += math.log(config.another)
         weight = self._weight[rows] * np.exp(log_likelihood - log_likelihood.max(axis=1, keepdims=True))
         weight = np.maximum(weight / weight.sum(axis=1, keepdims=True), MIN_WEIGHT)
         self._weight[rows] = weight
@@ -211,47 +215,6 @@ class Parallax:
         side_outlier = (after.outlier[..., : len(MODES)] * weight).sum(axis=-1).T
         self._side_outlier[rows] = side_outlier
         return self._size_measurements(rows, of_face + config.sigma_scale_rel**2, in_path, side_outlier)
-
-    def _with_another(
-        self,
-        P: Floats,
-        J: Floats,
-        S: Floats,
-        noise: Floats,
-        innovation: Floats,
-        boxes: ParallaxMeasurements,
-        T_world_ego: SE2,
-        log_likelihood: Floats,
-    ) -> NDArray[np.bool_]:
-        """(N, FILTERS): where the box is likelier of another standing vehicle than `log_likelihood` (N, FILTERS) has it
-        of this one, with a side that is an outlier or without. P (N, FILTERS, 8, 8) grows there.
-
-        Along a row of parked vehicles boxes are mistaken for a neighbour's: what stands then seems to leap once, and
-        that is no motion. Its place and its size are its own.
-        """
-        config, changed = self.config, np.zeros(P.shape[:2], np.bool_)
-        stand = np.array([*STATIONARY, *WITHOUT_GROUND])
-        fits = log_likelihood[:, stand]
-        at = np.flatnonzero(
-            _squared_mahalanobis(innovation[:, [STANDING]], S[:, [STANDING]])[:, 0] > config.leap_sigma**2
-        )
-        if not len(at):
-            return changed
-        along = np.column_stack([np.ones(len(at)), boxes.bearing[at]]) * (
-            config.sigma_another_rel * boxes.depth_m[at, None]
-        )
-        ray = along @ T_world_ego.rotation().T
-        leapt = P[np.ix_(at, stand)]
-        leapt[..., :2, :2] += (ray[:, :, None] * ray[:, None, :])[:, None] + config.sigma_another_m**2 * np.eye(2)
-        leapt[..., HEIGHT, HEIGHT] += self._another_var
-        leapt[..., WIDTH, WIDTH] += self._another_var
-        J_at = J[np.ix_(at, stand)]
-        S_at = J_at @ leapt @ J_at.swapaxes(-1, -2) + noise[np.ix_(at, stand)]
-        better = _log_likelihood(innovation[np.ix_(at, stand)], S_at) + math.log(config.another) > fits[at]
-        rows, columns = np.nonzero(better)
-        P[at[rows], stand[columns]] = leapt[rows, columns]
-        changed[at[rows], stand[columns]] = True
-        return changed
 
     def _noise(
         self, boxes: ParallaxMeasurements, innovation: Floats, S: Floats, of_box: Floats, face_var: Floats
@@ -296,7 +259,7 @@ class Parallax:
         weight = self._weight[rows]
         square = np.square(self._x[rows][:, MOVING, VX:HEIGHT]).sum(axis=-1)
         return LearnedSize(
-            np.column_stack([weight[:, STATIONARY], weight[:, MOVING].sum(axis=1)]),
+            np.column_stack([weight[:, STATIONARY], 1.0 - weight[:, STATIONARY].sum(axis=1)]),
             np.column_stack([log_height, prior]),
             np.column_stack([variance, np.full(len(rows), UNKNOWN)]),
             np.sqrt((weight[:, MOVING] * square).sum(axis=1)),
@@ -307,10 +270,4 @@ class Parallax:
 def _squared_mahalanobis(gap: Floats, S: Floats) -> Floats:
     """(...): Mahalanobis distances squared of gaps (..., 4) with covariances (..., 4, 4)."""
     out: Floats = np.einsum("...a,...a->...", gap, np.linalg.solve(S, gap[..., None])[..., 0])
-    return out
-
-
-def _log_likelihood(innovation: Floats, S: Floats) -> Floats:
-    """(...), less a constant."""
-    out: Floats = -0.5 * (_squared_mahalanobis(innovation, S) + np.log(np.linalg.det(S)))
     return out

@@ -41,8 +41,8 @@ class ParallaxConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     side_outlier_memory_s: Annotated[float, msgspec.Meta(gt=0.0)] = 0.15  # how long one lasts
     sigma_side_outlier_rel: float = 0.3  # of the box's width
     gate_sigma: float = 3.0  # past it of all filters a measurement is an outlier: its noise is raised
-    another: float = 0.02  # of the boxes: they are of another vehicle than the track's
-    leap_sigma: float = 2.5  # what stands and is seen farther off than that may be another vehicle
+    own_for_s: float = 5.0  # on average, until boxes are those of a neighbour of the track's vehicle
+    another_for_s: float = 0.5  # until that neighbour is the track's vehicle
     sigma_another_rel: float = 0.15  # how far off it stands along the line of sight: a row of parked vehicles
     sigma_another_m: float = 1.0  # and across it
     sigma_another_size_rel: float = 0.1  # how much its size differs
