@@ -27,7 +27,7 @@ from birdslam.loops.merging import MergeError, merged
 from birdslam.loops.place_index import PlaceIndex, learn_words
 from birdslam.loops.place_map import MapCamera, PlaceMap
 from birdslam.loops.session import MapSession
-from birdslam.loops.verification import LocalMap, locate
+from birdslam.loops.verification import OTHER_VIEW_PX, LocalMap, locate
 from birdslam.outputs.map_trajectory import MapTrajectory, TrajectoryFiles
 from birdslam.perf.maps import scale_drift
 from birdslam.runtime.batch.one_map import DRIVE_MAP, join
@@ -225,6 +225,25 @@ def test_of_the_places_that_far_points_allow_it_is_the_likeliest_and_not_that_of
     found = locate(CAMERA, Features(px, np.full(len(px), 0.5), descriptors), local, guess, 120.0)
     assert found is not None
     assert found.T_keyframe_ego.log() == pytest.approx(np.zeros(3), abs=0.1)
+
+
+def test_uncertain_depths_draw_who_drives_aside_no_nearer_to_the_keyframe(mapped: bytes) -> None:
+    """Errors in variables attenuate a slope: by depths that err by 6 % who is 3 m aside seemed to be .08 m less so."""
+    chance, T, keyframe = np.random.default_rng(3), SE2(0.0, -3.0, 0.0), decode_map(mapped).keyframes[0]
+    off, sigma, most_m = [], [], (40.0, 12.0, 5.0)
+    for _ in range(60):
+        points = chance.uniform((8.0, -12.0, 0.5), most_m, (60, 3))
+        from_camera = points - (0.0, 0.0, CAMERA.height_m)
+        errs = 0.06 * chance.standard_normal((60, 1))
+        px = seen_from(points, T) + math.hypot(0.5, OTHER_VIEW_PX) * chance.standard_normal((60, 2))
+        descriptors = chance.integers(0, 256, (60, 32), dtype=np.uint8)
+        local = LocalMap(keyframe, points + errs * from_camera, 0.06 * from_camera, descriptors)
+        found = locate(CAMERA, Features(px, np.full(60, 0.5), descriptors), local, T, 120.0)
+        assert found is not None
+        off.append(T.between(found.T_keyframe_ego).log())
+        sigma.append(np.sqrt(np.diag(found.cov)))
+    assert np.mean(off, axis=0)[1] == pytest.approx(0.0, abs=0.03)
+    assert np.sqrt(np.mean((np.array(off) / sigma) ** 2, axis=0)) == pytest.approx(np.ones(3), abs=0.25)
 
 
 def test_a_step_that_no_car_makes_is_no_localisation(mapped: bytes) -> None:

@@ -53,7 +53,7 @@ WAITING_IMAGES = 4  # of frames whose estimates have not come yet: the oldest, h
 # frames feel, whatever its priority: caches and memory are shared
 CPU_SHARE = 0.25
 SAVE_EVERY_S, SAVE_SHARE = 10.0, 0.02  # and a large map so seldom that writing it takes no more of the time
-NICENESS = 19  # all others go first
+NICENESS = 10  # all others go first
 SUMMARY = "map.json"  # beside the logs: what the supervisor puts into summary.json
 
 log = logging.getLogger(__name__)
