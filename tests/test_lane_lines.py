@@ -29,7 +29,7 @@ from birdslam.lanes.outline import lane_mask, lane_px, line_px
 from birdslam.lanes.paint import RESOLVED_M, LinePoints, paint_points
 from birdslam.lanes.road_view import road_view
 from birdslam.lanes.topology import lane_row
-from birdslam.lanes.traffic import Traffic, TrafficState
+from birdslam.lanes.traffic import STATED_SIDE, Traffic, TrafficState, stated
 from birdslam.lanes.users import UserInEgo, person_in_ego
 from birdslam.outputs.drive_video import MOST_SCALE, MOST_WIDTH_PX, SideBySide
 from birdslam.outputs.line_map import LineMap
@@ -186,6 +186,22 @@ def test_lines_over_a_crest_and_through_a_sag(vertical_per_m: float) -> None:
     assert np.median(np.abs(off)) < 0.15
     assert np.mean(np.abs(off) < 2.0 * np.array(sigmas)) > 0.9
     assert bends[-1] == pytest.approx(vertical_per_m, abs=4e-4)
+
+
+def test_a_direction_of_travel_that_is_off_for_long_does_not_drag_lines_along() -> None:
+    tracker, off, sigmas = LineTracker(CAMERA), [], []
+    for k in range(24):
+        true, told = SE2(2.5 * k, 0.0, 0.0), SE2(2.5 * k, 0.02 * 2.5 * k, 0.0)
+        image, masks = picture(true, (1.75, -1.75), (True, False))
+        # Nothing nearer than 8 m is in view
+        edge_px = np.array([[0.0, 168.0], [639.0, 168.0]])
+        tracker.update(told, CAMERA.ground, (0.003, 0.0), image, masks.above(edge_px), NOBODY, bonnet_px=edge_px)
+        for found in tracker.lines().at(told) if k >= 10 else ():
+            if found.kind is not LineKind.EDGE:
+                off.append(found.y_m(4.0) - math.copysign(1.75, found.offset_m))
+                sigmas.append(found.sigma_m(4.0))
+    assert abs(np.mean(off)) < 0.04
+    assert np.mean(np.abs(off) < 2.0 * np.array(sigmas)) > 0.9
 
 
 def test_a_line_is_drawn_on_the_road_as_far_as_a_crest_shows_it() -> None:
@@ -354,6 +370,14 @@ def test_an_arrow_is_no_bound() -> None:
     assert row.ego == 1
 
 
+@pytest.mark.parametrize(("kerb_m", "bound"), [(-1.95, Bound.EDGE), (-1.55, Bound.PAINT)])
+def test_a_bright_kerbstone_past_the_roads_edge_is_no_bound(kerb_m: float, bound: Bound) -> None:
+    row = lane_row((line(1, 1.7), line(2, -1.75, LineKind.EDGE), line(3, kerb_m)))
+    assert row.ego == 0
+    assert row.lanes[0].right_bound is bound
+    assert row.lanes[0].right_m(0.0) == pytest.approx(-1.75 if bound is Bound.EDGE else kerb_m)
+
+
 def test_a_lane_with_one_line_is_completed_and_says_so() -> None:
     row = lane_row((line(1, 1.6),), usual_m=3.2, usual_sigma_m=0.2)
     assert row.ego == 0
@@ -505,6 +529,52 @@ def test_beyond_a_line_where_others_drove_who_is_new_drives_too() -> None:
     assert stood.oncoming < 0.5 * unknown.oncoming
 
 
+def test_the_side_of_the_road_is_stated_and_corrected_by_who_comes() -> None:
+    lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8), line(3, -5.3)), 0)
+    cov = np.diag([1.0, 0.04, 0.01])
+
+    def oncoming(drives_on: str, come_at_m: float | None = None) -> tuple[float, float]:
+        """Of somebody new at the left and at the right, whose way is not known."""
+        traffic = Traffic(stated(drives_on))
+        for k in range(3 if come_at_m is not None else 0):
+            with_users(lanes, [UserInEgo(k, SE2(30.0, come_at_m or 0.0, math.pi), cov, 4.0, 12.0)], 10.0, traffic)
+        elsewhere = EgoLane().lanes(tuple(line(10 + k, y) for k, y in enumerate((5.2, 1.7, -1.8, -5.3))), 0)
+        users = [UserInEgo(8 + k, SE2(40.0, y, math.pi), cov, 4.0, 0.0, 8.0) for k, y in enumerate((3.4, -3.5))]
+        left, right = with_users(elsewhere, users, 10.0, traffic).vehicles
+        return left.oncoming, right.oncoming
+
+    left, right = oncoming("right")
+    assert left > 0.5 > 3.0 * right
+    assert oncoming("left") == pytest.approx((right, left), abs=0.02)
+    mended_left, mended_right = oncoming("right", come_at_m=-3.5)
+    assert mended_right > 0.5 > 3.0 * mended_left
+
+
+def test_a_row_of_parked_cars_beside_a_lane_in_which_others_drive() -> None:
+    lanes = EgoLane().lanes((line(1, 1.7), line(2, -1.8)), 0)
+    cov, traffic = np.diag([1.0, 0.04, 0.01]), Traffic()
+    for k in range(4):
+        drove = UserInEgo(k, SE2(30.0, 3.4, math.pi), cov, 4.0, 12.0)
+        stood = UserInEgo(20 + k, SE2(20.0, 7.5, math.pi), cov, 4.0, 0.0, 0.1, standing=0.97)
+        with_users(lanes, [drove, stood], 10.0, traffic)
+    new = [UserInEgo(40 + k, SE2(40.0, y, math.pi), cov, 4.0, 0.0, 8.0, standing=0.5) for k, y in enumerate((3.4, 7.5))]
+    driving, parked = with_users(lanes, new, 10.0, traffic).vehicles
+    assert driving.oncoming > 0.8
+    assert parked.off_road > 0.6
+
+
+def test_a_speed_that_is_hardly_known_does_not_outweigh_the_side() -> None:
+    """A front taken for a back makes who comes drive along, at first."""
+    lanes = EgoLane().lanes((line(1, 1.7), line(2, -1.8)), 0)
+
+    def oncoming(sigma_mps: float) -> float:
+        user = UserInEgo(1, SE2(40.0, 9.0, 0.0), np.diag([1.0, 0.04, 0.01]), 4.0, 12.0, sigma_mps)
+        return with_users(lanes, [user], 10.0, Traffic()).vehicles[0].oncoming
+
+    assert oncoming(5.5) > 0.35
+    assert oncoming(1.0) < 0.01
+
+
 def true_line(number: int, kind: str, y_m: float) -> TrueLine:
     x = np.arange(0.0, 80.0, 2.0)
     return TrueLine(number, kind, np.column_stack([x, np.full(len(x), y_m)]))
@@ -565,7 +635,9 @@ def test_traffic_tells_which_way_a_lane_runs() -> None:
     before = with_users(lanes, [unknown], 10.0, traffic)
     assert before.lanes[0].oncoming is None
     assert before.lanes[1].oncoming == 0.0
-    assert before.vehicles[0].left == pytest.approx(1.0 - 48 / 81, abs=0.01)  # as KITTI's labels have it
+    right = 1.0 / (1.0 + math.exp(-STATED_SIDE))
+    by_labels = right * 19 / 30 + (1.0 - right) / 14  # as KITTI has them
+    assert before.vehicles[0].left == pytest.approx(1.0 - by_labels, abs=0.01)
     for _ in range(3):  # one car counts once
         told = with_users(lanes, [UserInEgo(1, SE2(30.0, 3.4, math.pi), cov, 4.0, 9.0), unknown], 10.0, traffic)
     assert told.lanes[0].oncoming == pytest.approx(1.0 / (1.0 + math.exp(-2.0)))

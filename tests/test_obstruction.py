@@ -11,6 +11,8 @@ from hypothesis import strategies as st
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.odometry.obstruction.bonnet import Bonnet, BonnetConfig
 from birdslam.odometry.obstruction.fixed_corners import FixedCorners, FixedCornersConfig
+from birdslam.odometry.obstruction.fixed_pattern import FixedPattern, FixedPatternConfig
+from birdslam.odometry.road.road_image import RoadImage
 
 CAMERA = Camera(width_px=640, height_px=192, fx_px=371.0, fy_px=371.0, cx_px=320.0, cy_px=96.0, height_m=1.5)
 GROUND = GroundPlane(1.5)
@@ -74,6 +76,41 @@ def test_corners_that_come_and_go_are_each_told(seed: int, count: int) -> None:
         fixed = fixed_corners.update(ids, px, GROUND, float(rng.uniform(0.0, 4.0)))
         assert fixed.shape == (count,)
         assert fixed.dtype == bool
+
+
+# --- the pattern on the glass ---
+
+
+@pytest.mark.parametrize("step_m", [0.3, 1.0, 3.0])
+def test_the_mean_of_the_images_is_over_metres_and_holds_little_of_the_road(step_m: float) -> None:
+    """What is seen for 3 m is in it with the same weight at any rate, so that it can't pull lengths."""
+    fixed_pattern = FixedPattern(FixedPatternConfig())
+    for k in range(round(90.0 / step_m)):
+        at_m = k * step_m
+        seen = 60.0 <= at_m < 63.0 - 1e-6
+        fixed_pattern.update_mean(np.full((20, 30), 100 if seen else 0, np.uint8), 10, step_m)
+        if at_m < 63.0 - 1e-6:
+            left = -float(fixed_pattern.subtract(np.zeros((20, 30), np.uint8), 10).mean())
+    assert left == pytest.approx(100.0 * 3.0 / FixedPatternConfig().memory_m, rel=0.1)
+
+
+def test_the_mean_begins_anew_with_a_pattern_that_has_come() -> None:
+    rng = np.random.default_rng(5)
+    pattern = cv2.GaussianBlur(rng.normal(0.0, 60.0, (92, 640)), (0, 0), 3.0)
+    fixed_pattern, before = FixedPattern(FixedPatternConfig()), None
+    px = np.stack(np.meshgrid(np.arange(5, 635, 3), np.arange(TOP_PX + 5, 187, 2)), axis=-1).reshape(-1, 2)
+    for k in range(40):
+        image = road_image(rng).astype(np.float64)
+        image[TOP_PX:] += pattern * (k >= 20) * 4.0
+        grey = np.clip(image, 0, 255).astype(np.uint8)
+        fixed_pattern.update_mean(grey, TOP_PX, 1.0)
+        road = RoadImage(grey, TOP_PX, 13, 2.0)
+        if before is not None:
+            fixed_pattern.detect(before, road, px, 1.0)
+        before = road
+    assert fixed_pattern.present
+    left = fixed_pattern.subtract(grey, TOP_PX).astype(np.float64)
+    assert float((left * pattern).sum() / (pattern**2).sum()) < 0.3 * 4.0  # of a mean over all 40 images 0.6
 
 
 # --- the bonnet ---

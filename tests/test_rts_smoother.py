@@ -106,11 +106,12 @@ def measured(
     depth_per_height: float = 0.0,
     standing: Floats | float = 0.0,
     sigma_m: float = 1.0,
+    sigma_log_height: Floats | float = 0.0,
 ) -> list[VehicleMeasurement]:
     """A vehicle straight ahead of an ego that stands, at `xs_m` (N,)."""
-    each = np.broadcast_arrays(xs_m, log_heights, standing)
+    each = np.broadcast_arrays(xs_m, log_heights, sigma_log_height, standing)
     out = []
-    for k, (x_m, log_height, stands) in enumerate(zip(*(a.tolist() for a in each), strict=True)):
+    for k, (x_m, log_height, sigma, stands) in enumerate(zip(*(a.tolist() for a in each), strict=True)):
         T = SE2(x_m, 0.0, 0.0)
         cov = (sigma_m**2, 0.0, 0.0, 0.0, 0.01, 0.0, 0.0, 0.0, 0.01)
         edge = VehicleEdge(
@@ -119,10 +120,10 @@ def measured(
             T_ego_vehicle=T,
             cov=cov,
             log_height=log_height,
+            sigma_log_height=sigma,
             depth_per_height=depth_per_height,
-            standing=stands,
         )
-        out.append(VehicleMeasurement(k, 0.1 * k, edge, SE2(), T))
+        out.append(VehicleMeasurement(k, 0.1 * k, edge, SE2(), T, stands))
     return out
 
 
@@ -137,6 +138,14 @@ def test_a_size_known_in_the_end_moves_every_measurement_by_what_its_depth_owed_
     assert np.abs(along(measured(seen_m, assumed, depth_per_height=1.0)) - 40.0).max() < 0.05
     assert np.abs(along(measured(seen_m, assumed, depth_per_height=0.0)) - 40.0).max() > 2.0
     assert smooth_vehicle(measured(seen_m[:1], assumed[:1], 1.0), CONFIG)[0].x_m == pytest.approx(seen_m[0])
+
+
+def test_a_last_look_that_is_less_sure_of_the_size_moves_little() -> None:
+    """As at a vehicle that leaves the image, cut by its border: 38 m of 20 % would be 8 m."""
+    assumed, sigma = np.full(30, 0.4), np.geomspace(0.08, 0.02, 30)
+    assumed[-1], sigma[-1] = 0.6, 0.06
+    seen_m = 38.0 * np.exp(assumed - 0.4) + 2.0
+    assert np.abs(along(measured(seen_m, assumed, 1.0, sigma_log_height=sigma)) - 40.0).max() < 0.1
 
 
 def test_what_stood_has_one_place_and_what_drove_has_not() -> None:

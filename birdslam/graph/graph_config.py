@@ -11,6 +11,7 @@ from birdslam.graph.weights import WeightsConfig
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0.0)]
 LandmarkAnchor = Literal["key_frame", "first_sight"]
+Side = Literal["right", "left"]
 Count = Annotated[int, msgspec.Meta(ge=1)]
 
 
@@ -40,6 +41,7 @@ class GraphConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     lasting_share: Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)] = 0.5
     lasting_s: Positive = 2.0  # for so long, of driving
     front_back_ambiguity: bool = True  # a CV edge may take a vehicle's front for its back; False: its yaw is believed
+    drives_on: Side = "right"  # the side of the road that traffic keeps to; those who come towards the ego correct it
     # Static map
     landmark_gate_sigma: Positive = 3.0  # Mahalanobis distance past which a landmark weighs less
     # Where X_p of Eq. 3 is. key_frame: where the last key frame saw it, as uncertain as that sight and that pose;

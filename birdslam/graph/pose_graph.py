@@ -37,7 +37,7 @@ from birdslam.graph.vehicles import SHORTEST_S, VehicleNodes, cv_edges
 from birdslam.graph.weights import WeightsConfig, weighted
 from birdslam.graph.window import Window
 from birdslam.lanes.occupancy import with_users
-from birdslam.lanes.traffic import Traffic
+from birdslam.lanes.traffic import Traffic, stated
 from birdslam.types import (
     INVALIDATING,
     BodyId,
@@ -88,7 +88,7 @@ class PoseGraph:
             solver()
         self.window: Window | None = None  # None before the first frame
         self._people: tuple[FollowedPerson, ...] = ()  # in the newest frame's ego
-        self._traffic = Traffic()
+        self._traffic = Traffic(stated(config.drives_on))
 
     def optimise(self, measurements: Measurements, records: Sequence[object] = ()) -> Estimate:
         """One frame's edges in; the newest frame's poses, velocities and covariances out.

@@ -9,17 +9,13 @@ import msgspec
 import numpy as np
 
 from birdslam.lanes.curves import across_sigma_m, basis, slope_basis
-from birdslam.lanes.traffic import Traffic, lines_between
+from birdslam.lanes.traffic import Traffic, Way, lines_between
 from birdslam.lanes.users import SLOW_MPS, UserInEgo
 from birdslam.types import Lane, Lanes, Leader, VehicleLane
 
 LEAST_LEADER = 0.5  # probability of the ego's lane
 FARTHEST_M = 120.0
 BEND_SIGMA_PER_M = 0.002  # 1-sigma of a lane's curvature beyond where it was seen
-# The share of those who drive that comes towards the ego, where nothing has shown it yet: beside the ego's lane, and
-# beyond all that are known. By the labels of KITTI tracking 0000 to 0020, each car once at a side: 48 of 81 that are 2
-# to 5.5 m aside, 71 of 93 up to 15 m; both sides together, since nothing says on which one drives here
-AGAINST_BESIDE, AGAINST_BEYOND = 0.59, 0.76
 
 
 def with_users(lanes: Lanes, users: Sequence[UserInEgo], ego_mps: float, traffic: Traffic) -> Lanes:
@@ -31,8 +27,8 @@ def with_users(lanes: Lanes, users: Sequence[UserInEgo], ego_mps: float, traffic
     traffic.observe(near, between)
     shares = _shares(lanes.lanes, near)
     placed = [
-        (user, _placed(user, lanes.ego_index, share, *traffic.shows(user, line)))
-        for user, share, line in zip(near, shares, between, strict=True)
+        (user, _placed(user, lanes.ego_index, share, traffic.way(user, seen)))
+        for user, share, seen in zip(near, shares, between, strict=True)
     ]
     ahead = [
         (user, where)
@@ -47,10 +43,8 @@ def with_users(lanes: Lanes, users: Sequence[UserInEgo], ego_mps: float, traffic
     )
 
 
-def _placed(
-    user: UserInEgo, index: int | None, shares: list[float], drives: float, against: float | None
-) -> VehicleLane:
-    """`shares`: the probability of each lane, of which `index` is the ego's; `drives`, `against`: as Traffic.shows."""
+def _placed(user: UserInEgo, index: int | None, shares: list[float], way: Way) -> VehicleLane:
+    """`shares`: the probability of each lane, of which `index` is the ego's."""
     total = sum(shares)
     if total > 1.0:  # neighbours' bounds need not meet
         shares = [share / total for share in shares]
@@ -58,11 +52,11 @@ def _placed(
     left = sum(shares[:index] if index is not None else (), 0.0)
     right = sum(shares[index + 1 :] if index is not None else (), 0.0)
     off = max(0.0, 1.0 - ego - left - right)
-    beside, beyond = (AGAINST_BESIDE, AGAINST_BEYOND) if against is None else (against, against)
-    beside, beyond = beside * drives, beyond * drives
     # Who comes towards us drives on a road, also beyond the lanes that are known
-    oncoming = beside * (left + right) + beyond * off
-    left, right, off = (1.0 - beside) * left, (1.0 - beside) * right, (1.0 - beyond) * off
+    at_left, at_right = way.drives * way.left[0], way.drives * way.right[0]
+    beyond = way.drives * (way.left if user.T_ego_vehicle.y_m > 0.0 else way.right)[1]
+    oncoming = at_left * left + at_right * right + beyond * off
+    left, right, off = (1.0 - at_left) * left, (1.0 - at_right) * right, (1.0 - beyond) * off
     ego, left, right, oncoming, off = (min(share, 1.0) for share in (ego, left, right, oncoming, off))  # of rounding
     return VehicleLane(vehicle=user.vehicle, ego_lane=ego, left=left, right=right, oncoming=oncoming, off_road=off)
 

@@ -24,6 +24,7 @@ LEAST_STRIP_M = 0.8  # a hard shoulder, a cycle lane
 NO_LANE_COST = 0.6  # of a strip that is no lane
 WIDE_COST = 0.4  # of a lane wider than most
 PAINT_AT_EDGE_M = 0.6  # nearer to the road's edge than this a painted line is that edge's
+LEAST_KERB_M = 0.1  # so far past the edge; a mask's border wanders about paint
 WIDTH_M, WIDTH_SIGMA_M = 3.4, 0.4  # of a lane nobody has measured
 NARROWEST_M = 1.9  # where no car fits between a lane's lines any more
 STEP_M, SURE_SIGMAS = 2.0, 2.0  # along a lane, in search of its end
@@ -58,7 +59,8 @@ def _holds_ego(lane: Lane) -> bool:
 
 def _bounds(lines: tuple[LaneLine, ...]) -> list[LaneLine]:
     """The lines that bound lanes, from left to right."""
-    paint = [line for line in lines if line.kind is not LineKind.EDGE]
+    edges = [line for line in lines if line.kind is LineKind.EDGE]
+    paint = [line for line in lines if line.kind is not LineKind.EDGE and not any(_is_kerb(line, e) for e in edges)]
     usable = paint + [
         line
         for line in lines
@@ -75,6 +77,12 @@ def _bounds(lines: tuple[LaneLine, ...]) -> list[LaneLine]:
                 choice = score, [*best[j][1], line]
         best.append(choice)
     return max(best, key=lambda item: item[0])[1] if best else []
+
+
+def _is_kerb(line: LaneLine, edge: LaneLine) -> bool:
+    """Whether a bright line is a kerbstone: it lies just past the road's edge; paint lies before it."""
+    past_m = (line.y_m(AT_M) - edge.y_m(AT_M)) * math.copysign(1.0, edge.y_m(AT_M))
+    return LEAST_KERB_M < past_m < PAINT_AT_EDGE_M
 
 
 def _strip_cost(left: LaneLine, right: LaneLine) -> float:

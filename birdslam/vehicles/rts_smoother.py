@@ -1,11 +1,11 @@
-"""Vehicles' trajectories after a drive: smoothed, with their sizes as known at the end, and with their later motion.
+"""Vehicles' trajectories after a drive: smoothed, with their sizes as known after it, and with their later motion.
 
-Once a height is known better, every earlier measurement moves along its line of sight (the smoother of a state that
-does not change; Rauch, Tung and Striebel 1965):
+Once a height is known better, every measurement moves along its line of sight by what it owes to the one assumed then:
 
-    log z = log z_then + (d log z / d log h) (log h_now - log h_then)
+    log z = log z_then + (d log z / d log h) (log h - log h_then)
 
-then all go through an RTS smoother of constant velocity with stops. The ego's trajectory is the live one.
+then all go through an RTS smoother (Rauch, Tung and Striebel 1965) of constant velocity with stops. The ego's
+trajectory is the live one.
 """
 
 from __future__ import annotations
@@ -29,6 +29,8 @@ Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 STANDING_PROBABILITY = 0.5  # the probability from which on a vehicle is taken to stand
 MIN_COV_SHARE = 0.1  # of a measurement's variance along the line of sight: not all of it is the size's
 MIN_DEPTH_M = 1.0
+MIN_SIGMA_LOG_HEIGHT = 1e-3
+NOT_JUDGED = 0.5  # the probability of standing in an estimate of what nobody knows, or where no graph judges it
 MIN_PROBABILITY = 1e-3  # and 1 less it is the largest
 
 
@@ -46,20 +48,24 @@ class SmootherConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class VehicleMeasurement:
-    """A vehicle in one frame: its CV edge, the ego's pose then, and the vehicle's as the live graph had it."""
+    """A vehicle in one frame: its CV edge, the ego's pose then, and the vehicle's as the live graph had it.
+
+    `standing` is how probably it stands, by all that was known then.
+    """
 
     frame_id: int
     t_s: float
     edge: VehicleEdge
     T_world_ego: SE2
     T_world_vehicle: SE2
+    standing: float
 
 
 class RtsSmoother:
     """add() each frame with its live estimate; smooth() at any time.
 
     State, of each vehicle: x, y (m) and vx, vy (m/s) of its centre in the world of its epoch. Measurements: the places
-    (m) of its CV edges, corrected for the size that is known last. Read by evaluation (final trajectories).
+    (m) of its CV edges, corrected for the size that all of them tell. Read by evaluation (final trajectories).
     """
 
     def __init__(self, config: SmootherConfig) -> None:
@@ -68,11 +74,13 @@ class RtsSmoother:
 
     def add(self, measurements: Measurements, estimate: Estimate) -> None:
         """One frame's edges, and where they left everybody."""
-        poses = {v.vehicle: v.T_world_vehicle for v in estimate.vehicles}
+        estimated = {v.vehicle: v for v in estimate.vehicles}
         t_s = estimate.t_source_ns * 1e-9
         for edge in measurements.cv:
-            if edge.vehicle in poses:
-                one = VehicleMeasurement(estimate.frame_id, t_s, edge, estimate.T_world_ego, poses[edge.vehicle])
+            if (vehicle := estimated.get(edge.vehicle)) is not None:
+                standing = edge.standing if vehicle.standing == NOT_JUDGED else vehicle.standing
+                T_world_vehicle = vehicle.T_world_vehicle
+                one = VehicleMeasurement(estimate.frame_id, t_s, edge, estimate.T_world_ego, T_world_vehicle, standing)
                 self._measurements.setdefault((estimate.epoch, edge.vehicle), []).append(one)
 
     def smooth(self) -> dict[tuple[int, int], dict[int, SE2]]:
@@ -88,7 +96,7 @@ def smooth_vehicle(seen: Sequence[VehicleMeasurement], config: SmootherConfig) -
     """frame -> T_world_vehicle of one vehicle; its yaw is the live one."""
     t_s = np.array([one.t_s for one in seen])
     places, covs = _size_corrected(seen)
-    stood = _smooth_standing(np.array([one.edge.standing for one in seen]), np.diff(t_s), config)
+    stood = _smooth_standing(np.array([one.standing for one in seen]), np.diff(t_s), config)
     gaps_s = np.maximum(np.diff(t_s, prepend=t_s[0] - config.box_memory_s), 1e-3)
     covs = covs * np.maximum(1.0, config.box_memory_s / gaps_s)[:, None, None]
     found, log_likelihood = _smooth(t_s, places, covs, np.zeros(len(t_s), np.bool_), config)
@@ -104,9 +112,9 @@ def smooth_vehicle(seen: Sequence[VehicleMeasurement], config: SmootherConfig) -
 
 
 def _size_corrected(seen: Sequence[VehicleMeasurement]) -> tuple[Floats, Floats]:
-    """Centres (N, 2) in world, had each been placed with the last height, and (N, 2, 2) without the height's error."""
+    """Centres (N, 2) in world, had each been placed with the one height, and (N, 2, 2) without the height's error."""
     places, covs = np.zeros((len(seen), 2)), np.zeros((len(seen), 2, 2))
-    log_height = seen[-1].edge.log_height
+    log_height = _log_height(seen)
     for k, one in enumerate(seen):
         edge, T = one.edge, one.edge.T_ego_vehicle
         centre = np.array([T.x_m, T.y_m])
@@ -123,6 +131,24 @@ def _size_corrected(seen: Sequence[VehicleMeasurement]) -> tuple[Floats, Floats]
         places[k] = one.T_world_ego @ (centre + growth * sight_line)
         covs[k] = R_world_ego @ cov @ R_world_ego.T
     return places, covs
+
+
+def _log_height(seen: Sequence[VehicleMeasurement]) -> float:
+    """The logarithm of a vehicle's height by all frames.
+
+    The last frame's is not always the best: what parallax says of it is not kept, and a vehicle that leaves is cut or
+    far. So each frame counts by its information beyond the first one's, which has the class's prior; of the frames
+    that know most of it the prior gets as much beside it as there.
+    """
+    log_height = np.array([one.edge.log_height for one in seen])
+    information = np.array([max(one.edge.sigma_log_height, MIN_SIGMA_LOG_HEIGHT) for one in seen]) ** -2.0
+    gained = np.maximum(information - information[0], 0.0)
+    most = float(gained.max())
+    if most <= 0.0:
+        return float(log_height[-1])
+    told = information * log_height - information[0] * log_height[0]  # gained times the height that it is of
+    of_frames = float(gained @ told / (gained @ gained))
+    return float((information[0] * log_height[0] + most * of_frames) / (information[0] + most))
 
 
 def _smooth_standing(standing: Floats, gaps_s: Floats, config: SmootherConfig) -> Floats:

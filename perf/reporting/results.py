@@ -16,7 +16,7 @@ from typing import Any
 
 import msgspec
 
-from birdslam.bench.tracking.benchmark import EGO, Row, mean_ate_m
+from birdslam.bench.tracking.benchmark import EGO, SEEN_EXACTLY, Row, mean_ate_m
 from birdslam.bench.tracking.tables import METHOD_TITLES, read_published
 from birdslam.perf.errors import PerfError
 from birdslam.perf.reporting import measured
@@ -55,6 +55,7 @@ METHODS = {
     "nair": "Nair et al., re-implemented",
     "birdslam_live": "ours, live",
     "birdslam": "**ours, final**",
+    SEEN_EXACTLY: "of it the ego's: cars seen exactly from our live ego",
 }
 
 Figures = Any  # plain JSON

@@ -38,6 +38,7 @@ from birdslam.vehicles.placement.pseudolidar import FrustumNetwork
 from birdslam.vehicles.rts_smoother import RtsSmoother, SmootherConfig
 
 EGO = "ego"
+SEEN_EXACTLY = "seen_exactly"  # instead of a method's name: its errors, had the live ego seen every vehicle exactly
 LEAST_FRAMES = 5  # a vehicle matched in fewer is left out of the report, unless the paper names it
 
 NO_IMAGE = np.zeros((1, 1), dtype=np.uint8)  # for an odometry that needs none
@@ -229,6 +230,14 @@ class Truth:
             out[str(label)] = path_errors(self.vehicles[label], self.found(label, result))
         return out
 
+    def errors_by_ego(self, result: Trajectories) -> dict[str, PathErrors | None]:
+        """As `errors`, had every vehicle been seen exactly: what of them is the ego's."""
+        out = {EGO: path_errors(self.ego, result.ego)}
+        for label, poses in self.vehicles.items():
+            seen = {k: result.ego[k] @ self.ego[k].between(poses[k]) for k in self.found(label, result) if k in poses}
+            out[str(label)] = path_errors(poses, seen)
+        return out
+
 
 class Row(msgspec.Struct, frozen=True, kw_only=True):
     """One body in one sequence by one method: medians over the seeds, and the standard deviation of `ate_m`."""
@@ -282,6 +291,8 @@ def run_trial(
     truth = Truth.of(sequence, log)
     labelled = {EGO: len(truth.ego)} | {str(label): len(poses) for label, poses in truth.vehicles.items()}
     errors = {name: truth.errors(solved[method], bodies) for name, method in chosen.items()}
+    if (live := chosen.get("birdslam_live")) is not None:
+        errors[SEEN_EXACTLY] = truth.errors_by_ego(solved[live])
     unconverged = frozenset(name for name, method in chosen.items() if not solved[method].converged)
     return Trial(errors, labelled, truth.tracks(), hota(truth.boxes), idf1(truth.boxes), unconverged)
 

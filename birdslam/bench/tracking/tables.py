@@ -13,7 +13,7 @@ from pathlib import Path
 import msgspec
 
 from birdslam.bench.figures import markdown, mean, number
-from birdslam.bench.tracking.benchmark import EGO, Row, mean_ate_m
+from birdslam.bench.tracking.benchmark import EGO, SEEN_EXACTLY, Row, mean_ate_m
 from birdslam.bench.tracking.movers import MoversRow
 from birdslam.bench.tracking.relative_nees import NeesRow
 from birdslam.bench.tracking.reported import MotionRow, RangeRow
@@ -28,7 +28,11 @@ ODOMETRIES = {  # as it is called in a row, and at length
     "truth": ("true odometry", "TRUTH (no error)"),
     "images": ("images", "from the images where a row says so"),
 }
-OURS = {"birdslam_live": "ours, live", "birdslam": "**ours, final**"}
+OURS = {
+    "birdslam_live": "ours, live",
+    "birdslam": "**ours, final**",
+    SEEN_EXACTLY: "the ego's part: cars seen exactly from ours, live",
+}
 Cells = dict[str, dict[str, float]]  # sequence -> body -> metres
 
 METHOD_TITLES = {

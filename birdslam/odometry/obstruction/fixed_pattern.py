@@ -4,7 +4,8 @@ It correlates perfectly at standstill and outweighs the road on smooth asphalt. 
 of two images between which the car has driven. Lane lines do correlate too, so the past image, warped by the car's
 motion, is first projected out of it. Where there is a pattern, the running mean of the images, which holds the pattern
 and no moving road, is subtracted from each (fixed-pattern correction), without contrast normalisation: paint counts
-then, and not the noise around it. docs/method.md has the correlations.
+then, and not the noise around it. The mean is over metres: one over a few images holds the road that is compared, and
+at each rate elsewhere. docs/method.md has the correlations and what that cost.
 """
 
 from __future__ import annotations
@@ -28,26 +29,36 @@ class FixedPatternConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     on_threshold: Positive = 0.32  # correlation of equal pixels, above which there is a pattern
     off_threshold: Positive = 0.22  # correlation below which there is none any more
     min_baseline_m: Positive = 0.5  # driven between the two images
-    memory_images: Annotated[int, msgspec.Meta(ge=2)] = 8  # shorter than a dash's period at 30 m/s and 25 Hz
+    memory_m: Positive = 40.0  # driven, over which the mean goes: more than an image shows of the road
     judged_images: Annotated[int, msgspec.Meta(ge=1)] = 5  # time constant of the correlation's mean
+    # Judged to be without a pattern, until one that is found must have come: one that was there is found in six
+    absent_images: Annotated[int, msgspec.Meta(ge=1)] = 10
 
 
 class FixedPattern:
-    """State: the mean image and the mean correlation. Reader: `RoadScale`, for the images that it aligns."""
+    """State: the mean images and the mean correlation. Reader: `RoadScale`, for the images that it aligns."""
 
     def __init__(self, config: FixedPatternConfig) -> None:
         self.config = config
         self._mean: Grey | None = None
-        self._images = 0
+        self._recent: Grey | None = None
+        self._images = 0  # that the mean is of, at most
+        self._absent = 0  # images in a row that were judged to have no pattern
         self._correlation = 0.0
         self.present = False
 
-    def update_mean(self, grey: NDArray[np.uint8], top_px: int) -> None:
-        """Takes (H, W) grey into the mean, rows from `top_px` on."""
-        if self._mean is None:
-            self._mean = np.zeros((grey.shape[0] - top_px, grey.shape[1]), np.float32)
+    def update_mean(self, grey: NDArray[np.uint8], top_px: int, travelled_m: float) -> None:
+        """Takes (H, W) grey into the mean, rows from `top_px` on, `travelled_m` after the image before.
+
+        All of the first images count alike, at any rate and while the unit of length may be far too small.
+        """
+        cfg, rows = self.config, grey[top_px:]
+        if self._mean is None or self._recent is None:
+            self._mean, self._recent = rows.astype(np.float32), rows.astype(np.float32)
         self._images += 1
-        cv2.accumulateWeighted(grey[top_px:], self._mean, max(1.0 / self._images, 1.0 / self.config.memory_images))
+        share = 1.0 - float(np.exp(-travelled_m / cfg.memory_m))
+        cv2.accumulateWeighted(rows, self._mean, max(1.0 / self._images, share))
+        cv2.accumulateWeighted(rows, self._recent, 1.0 / cfg.judged_images)
 
     def subtract(self, grey: NDArray[np.uint8], top_px: int) -> NDArray[np.float32]:
         """The rows from `top_px` on without the fixed pattern, smoothed as a RoadImage is."""
@@ -79,6 +90,9 @@ class FixedPattern:
         self._correlation += (correlation - self._correlation) / cfg.judged_images
         before = self.present
         self.present = self._correlation > (cfg.off_threshold if before else cfg.on_threshold)
+        if self.present and self._absent >= cfg.absent_images and self._recent is not None:
+            self._mean, self._images = self._recent.copy(), cfg.judged_images
+        self._absent = 0 if self.present else self._absent + 1
         return self.present != before
 
 

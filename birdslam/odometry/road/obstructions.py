@@ -48,10 +48,10 @@ class RoadObstructions:
         if not self._bonnet.initialised:
             self._bonnet.update(grey, self._aligner.top_px, np.inf)
 
-    def frame(self, grey: NDArray[np.uint8]) -> RoadFrame:
-        """The present image, corrected for a fixed pattern where there is one."""
+    def frame(self, grey: NDArray[np.uint8], travelled_m: float) -> RoadFrame:
+        """The present image, `travelled_m` after the one before, corrected for a fixed pattern where there is one."""
         raw, top_px = self._aligner.image(grey), self._aligner.top_px
-        self._fixed_pattern.update_mean(grey, top_px)
+        self._fixed_pattern.update_mean(grey, top_px, travelled_m)
         if not self._fixed_pattern.present:
             return RoadFrame(raw, raw)
         return RoadFrame(raw, RoadImage.of(self._fixed_pattern.subtract(grey, top_px), top_px))

@@ -157,7 +157,7 @@ class RoadScale:
         self._since_m += travelled_m
 
         self._update_bonnet(view, travelled_m)
-        frame, pose = self._obstructions.frame(view.grey), view.pose
+        frame, pose = self._obstructions.frame(view.grey, travelled_m), view.pose
         factor = float(np.exp(np.clip(self._filter.pending_log, -0.1, 0.1)))
         self._filter.pending_log = 0.0
         keyframe = self._keyframe(pose)
