@@ -22,9 +22,7 @@ SPACING_M = 4.0  # between keyframes: with MOST_POINTS below 2 MB a km
 MOST_POINTS = 150
 LEAST_POINTS = 25  # a keyframe with fewer can't be found again
 REACH_M = 5.0  # of the frames that triangulate a keyframe's points, before and after it
-FRAMES = 12  # of them: more add little
-# A frame is looked at after so much way, or so much time
-LOOK_M, LOOK_NS = 2.0 * REACH_M / FRAMES, 500_000_000
+LOOK_M, LOOK_NS = 0.4, 500_000_000  # a frame is looked at after so much way, or so much time
 GRID_CELLS = 8, 4
 NODE_AT_M = 6.0  # ahead of the ego: there a line is in view and known best
 NODE_EVERY_M = 2.0
@@ -129,7 +127,7 @@ class KeyframeBuilder:
 
     def _make(self, look: Look) -> NewKeyframe | None:
         around = [o for o in self._window if o is not look and abs(o.travelled_m - look.travelled_m) <= REACH_M]
-        others = around[:: max(1, -(-len(around) // FRAMES))]
+        others = around[:: max(1, -(-len(around) // 12))]  # a dozen are enough
         points = triangulate(self._camera, self._view(look), [self._view(other) for other in others])
         kept = _spread(points, look.features.px[points.feature], (self._camera.width_px, self._camera.height_px))
         if len(kept) < LEAST_POINTS:
