@@ -246,7 +246,7 @@ class RoadScale:
         out: list[Status] = []
         if not self._sees_road() and not self._car.measures:
             out.append(Status.SCALE_CARRIED)
-        if self.unknown:
+        if self.unknown or self._confirmation.outweighed:
             out.append(Status.SCALE_INVALID)
         if self._confirmation.violated:
             out.append(Status.GROUND_VIOLATED)

@@ -7,6 +7,7 @@ from birdslam.odometry.scale_config import RoadScaleConfig
 TOLD = 0.5  # of an alignment's information about the length (kalman_filter.py): with more it counts as told
 _COMPARISONS = 5  # time constant of the mean of what they tell
 _ANOTHER_LOG = 0.3  # of the factor on the length by an alignment: a larger one begins the row anew
+_MOST_AGAINST = 10.0  # alignments that agreed on the length before, which as many must outweigh
 
 
 class ScaleConfirmation:
@@ -15,6 +16,7 @@ class ScaleConfirmation:
     def __init__(self, config: RoadScaleConfig) -> None:
         self.config = config
         self._told = 0.0  # by alignments in a row, each 0 to 1
+        self._against = 0.0  # told of another length by those in a row before
         self._rejected = 0.0  # in a row, each by its new share of the path: those of one view err together
         self.rejections = 0  # their number
         self._mean, self._comparisons = 0.0, 0  # mean information of comparisons about the length, and their number
@@ -28,6 +30,14 @@ class ScaleConfirmation:
     def known(self) -> bool:
         """Whether enough have."""
         return self._told > self.config.confirmations - TOLD
+
+    @property
+    def outweighed(self) -> bool:
+        """Whether more have agreed on another length just before.
+
+        Where the motion's direction is wrong no right length correlates, and a false one may for a while.
+        """
+        return self._told < self._against
 
     @property
     def contradicted(self) -> bool:
@@ -46,7 +56,7 @@ class ScaleConfirmation:
 
     def forget(self) -> None:
         """The length is unknown."""
-        self._told = 0.0
+        self._told = self._against = 0.0
 
     def reject(self, new: float) -> None:
         """An alignment was rejected, of which this share of the path is new."""
@@ -67,4 +77,6 @@ class ScaleConfirmation:
 
     def confirm(self, tells: float, log_factor: float) -> None:
         """It has changed the length by this factor."""
-        self._told = tells if abs(log_factor) > _ANOTHER_LOG else self._told + tells
+        if abs(log_factor) > _ANOTHER_LOG:
+            self._against, self._told = min(self._told, _MOST_AGAINST), 0.0
+        self._told += tells
