@@ -184,3 +184,16 @@ def test_another_length_must_outweigh_those_that_agreed_on_the_one_before(agreed
         confirmation.confirm(1.0, 0.0)
         count += 1
     assert count == needed
+
+
+def test_a_weak_comparison_counts_where_two_before_found_the_same_length() -> None:
+    confirmation = ScaleConfirmation(RoadScaleConfig())
+    confirmation.reject(1.0, 3.4)
+    confirmation.reject(1.0)
+    confirmation.reject(1.0, 0.3)
+    assert not confirmation.found_before(3.45)
+    confirmation.reject(1.0, 3.5)
+    assert confirmation.found_before(3.45)
+    assert not confirmation.found_before(0.3)
+    confirmation.agree(1.0)
+    assert not confirmation.found_before(3.45)
