@@ -12,6 +12,7 @@ from birdslam.geometry.pose import Pose, rotation_exp
 from birdslam.odometry.road.alignment import RoadAlignConfig, RoadAligner
 from birdslam.odometry.road.fit import RoadFit
 from birdslam.odometry.road.kalman_filter import RoadFilter
+from birdslam.odometry.road.scale_confirmation import ScaleConfirmation
 from birdslam.odometry.scale_config import RoadScaleConfig
 from birdslam.perf.accuracy.graded_road import CURVE_M, GradedRoad, Stand
 
@@ -169,3 +170,30 @@ def test_a_drift_of_the_unit_does_not_tilt_the_road() -> None:
     without = pitch_under_drift(RoadScaleConfig(scale_drift_per_m=1e-9))
     assert without > 0.004
     assert pitch_under_drift(RoadScaleConfig()) < without / 3.0
+
+
+@pytest.mark.parametrize(("agreed", "needed"), [(1, 1), (5, 5), (40, 10)])
+def test_another_length_must_outweigh_those_that_agreed_on_the_one_before(agreed: int, needed: int) -> None:
+    confirmation = ScaleConfirmation(RoadScaleConfig())
+    for _ in range(agreed):
+        confirmation.confirm(1.0, 0.01)
+        assert not confirmation.outweighed
+    confirmation.confirm(1.0, math.log(0.2))
+    count = 1
+    while confirmation.outweighed:
+        confirmation.confirm(1.0, 0.0)
+        count += 1
+    assert count == needed
+
+
+def test_a_weak_comparison_counts_where_two_before_found_the_same_length() -> None:
+    confirmation = ScaleConfirmation(RoadScaleConfig())
+    confirmation.reject(1.0, 3.4)
+    confirmation.reject(1.0)
+    confirmation.reject(1.0, 0.3)
+    assert not confirmation.found_before(3.45)
+    confirmation.reject(1.0, 3.5)
+    assert confirmation.found_before(3.45)
+    assert not confirmation.found_before(0.3)
+    confirmation.agree(1.0)
+    assert not confirmation.found_before(3.45)

@@ -40,10 +40,10 @@ GATE_SIGMAS, LEAST_GATE_M, WIDEST_GATE_M = 3.0, 0.25, 0.7
 KERNEL_SIGMAS = 2.0  # Cauchy
 ITERATIONS = 4
 # What all lines of a road have in common, 1-sigma and the travel over which it lasts: its vertical curvature (the
-# tightest crest of a road for 50 km/h has a radius of 700 m, and lasts some 50 m), and the error of the odometry's
+# tightest crest for 50 km/h, of 700 m radius, is 2 sigma and lasts some 50 m), and the error of the odometry's
 # direction of travel (in the mean of a rendered drive 2 to 27 mrad, 11 by RMS; by night 9 tenths of it last over 5 m)
 VERTICAL, DIRECTION, COMMON = 0, 1, 2
-SIGMA_COMMON = np.array([1e-3, 0.01])
+SIGMA_COMMON = np.array([7e-4, 0.01])
 MEMORY_M = np.array([50.0, 40.0])
 LEAST_FALL = 0.3  # of a level road's: beyond it lies what a crest hides
 PLANE_AT_M = 11.0  # where the ground under the camera is measured: the middle of the road that odometry looks at

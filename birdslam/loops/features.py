@@ -102,15 +102,19 @@ def _once(corners: tuple[cv2.KeyPoint, ...]) -> list[cv2.KeyPoint]:
     return list(seen.values())
 
 
-def hamming(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> Ints:
-    """(N, M) distances in bits of descriptors (N, 32) and (M, 32)."""
-    if not len(a) or not len(b):
-        return np.zeros((len(a), len(b)), np.int64)
-    words_a, words_b = np.ascontiguousarray(a).view(np.uint64), np.ascontiguousarray(b).view(np.uint64)
-    out = np.zeros((len(a), len(b)), np.uint16)
-    for column_a, column_b in zip(words_a.T, words_b.T, strict=True):
-        out += np.bitwise_count(column_a[:, None] ^ column_b[None, :])
-    return out.astype(np.int64)
+def match(a: NDArray[np.uint8], b: NDArray[np.uint8], most_bits: int, ratio: float) -> Ints:
+    """(K, 2) rows of descriptors (N, 32) and (M, 32) that are each other's nearest, clearly so by Lowe's ratio test."""
+    import faiss  # here: only who compares whole images needs it
+
+    if len(a) < 1 or len(b) < 2:
+        return np.zeros((0, 2), np.int64)
+    faiss.omp_set_num_threads(1)  # the other cores are the frames'
+    a, b = np.ascontiguousarray(a), np.ascontiguousarray(b)
+    bits, nearest = faiss.knn_hamming(a, b, 2)
+    _, back = faiss.knn_hamming(b, a, 1)
+    good = (bits[:, 0] <= most_bits) & (bits[:, 0] < ratio * bits[:, 1])
+    good &= back[nearest[:, 0], 0] == np.arange(len(a))
+    return np.column_stack([np.flatnonzero(good), nearest[good, 0]])
 
 
 def match_near(
@@ -149,15 +153,3 @@ def match_near(
 
 
 NEVER = 10_000  # bits: more than any two descriptors differ by
-
-
-def match(distance: Ints, most_bits: int, ratio: float) -> Ints:
-    """(K, 2) pairs (row, column) that are each other's nearest, clearly so by Lowe's ratio test."""
-    if distance.shape[0] < 1 or distance.shape[1] < 2:
-        return np.zeros((0, 2), np.int64)
-    two = np.partition(distance, 1, axis=1)[:, :2]
-    nearest = distance.argmin(axis=1)
-    back = distance.argmin(axis=0)
-    rows = np.arange(len(distance))
-    good = (two[:, 0] <= most_bits) & (two[:, 0] < ratio * two[:, 1]) & (back[nearest] == rows)
-    return np.column_stack([rows[good], nearest[good]])

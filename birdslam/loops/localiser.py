@@ -23,6 +23,7 @@ from birdslam.loops.verification import Fix, locate
 from birdslam.types import Attitude, Estimate
 
 CANDIDATES = 6  # places that are verified by geometry in one frame
+SELDOM_M = 4.0  # of way, from one look-up among all places to the next, for who is on a way that the map does not know
 FOUND_INLIERS, FOUND_PLACES = 25, 7  # of a frame that nothing was known of
 FOUND_SHARE = 0.3  # of its matches that must fit
 KEPT_INLIERS, KEPT_PLACES = 18, 6  # of a frame that was foreseen
@@ -92,6 +93,7 @@ class Localiser:
         self._missed = False  # since the last fix a frame was looked for in the map, and not found
         self.own_way_m: dict[int, float] = {}  # rows of keyframes that this very drive made: the way at each
         self.was_kidnapped = False  # the newest fix contradicted odometry
+        self._looked_up_m = -math.inf  # the way at which a place was last looked up among all of the map
 
     @property
     def T_map_odom(self) -> SE2 | None:
@@ -224,6 +226,10 @@ class Localiser:
         if foreseen is not None and is_place(foreseen):
             self._suppose(foreseen, kidnapped=False)
             return False
+        unknown = self._T_map_ego is not None and not self._missed  # a street that the map lacks, as of a new map all
+        if unknown and self.travelled_m - self._looked_up_m < SELDOM_M:
+            return False
+        self._looked_up_m = self.travelled_m
         for row in self.map.index().look_up(features.descriptors, CANDIDATES, among):
             found = locate(self._camera, features, self.map.around(row, among), None)
             if found is None or not is_place(found):

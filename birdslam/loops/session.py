@@ -23,7 +23,7 @@ from birdslam.loops.keyframe_builder import LOOK_M, LOOK_NS, KeyframeBuilder, Lo
 from birdslam.loops.localiser import Localisation, Localiser, shared
 from birdslam.loops.map_pose import MapPose, MapState
 from birdslam.loops.place_map import PlaceMap
-from birdslam.types import Estimate, Status
+from birdslam.types import Estimate
 
 COVERED_M = 2.5  # where the map has a keyframe this near, and knew the drive by it, it needs no further one
 COVERED_INLIERS = 40
@@ -63,10 +63,10 @@ class MapSession:
 
     def step(self, estimate: Estimate, image: NDArray[np.uint8] | None) -> Localisation:
         """Where the ego of this frame is in the map."""
+        looked = image is not None and self.due(estimate)
         self._move(estimate)
         if self._extend:
             self._builder.nodes.add(estimate, self._travelled_m)
-        looked = image is not None and self._due(estimate)
         if looked:
             assert image is not None
             self._look(estimate, image)
@@ -90,8 +90,9 @@ class MapSession:
         """Before the first step: goes on where another session of the same drive had come to, in odometry's epoch."""
         self._resumed = pose
 
-    def _due(self, estimate: Estimate) -> bool:
-        way_m = self._travelled_m - self._looked_m
+    def due(self, estimate: Estimate) -> bool:
+        """Whether the image of the next frame is looked at."""
+        way_m = self._travelled_m + self._step_m(estimate) - self._looked_m
         return way_m >= LOOK_M or (way_m > 0.0 and estimate.t_source_ns - self._looked_ns >= LOOK_NS)
 
     def finish(self) -> None:
@@ -118,17 +119,20 @@ class MapSession:
             self.localiser.shift(poses[newest.number][0] @ newest.T_map_keyframe.inverse())
 
     def _move(self, estimate: Estimate) -> None:
-        if estimate.epoch != self._epoch or (
-            self._last is not None and Status.GRAPH_RESET in estimate.status and estimate.epoch != self._last.epoch
-        ):
+        if estimate.epoch != self._epoch:
             self._begin(estimate)
-        elif self._last is not None:
-            step = self._last.T_world_ego.between(estimate.T_world_ego)
-            self._travelled_m += math.hypot(step.x_m, step.y_m)
+        self._travelled_m += self._step_m(estimate)
         self._last = estimate
         self.localiser.move(estimate)
         if self._new_map and self._extend and not len(self.map) and not estimate.valid:
             self._place_origin(estimate)
+
+    def _step_m(self, estimate: Estimate) -> float:
+        """The way from the frame before, in odometry of the same epoch."""
+        if self._last is None or estimate.epoch != self._last.epoch:
+            return 0.0
+        step = self._last.T_world_ego.between(estimate.T_world_ego)
+        return math.hypot(step.x_m, step.y_m)
 
     def _begin(self, estimate: Estimate) -> None:
         """Odometry's frame begins; a new map's frame is that of its first drive."""

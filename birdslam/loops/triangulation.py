@@ -14,7 +14,7 @@ import numpy as np
 from birdslam.geometry.arrays import Bools, Floats, Ints
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import rotation_exp, rotation_log
-from birdslam.loops.features import Features, hamming, match
+from birdslam.loops.features import Features, match
 from birdslam.trajectory import Transform, inverse
 
 MATCH_BITS = 60  # neighbouring frames look alike
@@ -84,7 +84,7 @@ def _observations(own: Features, others: Sequence[View]) -> tuple[Ints, Ints, Fl
     """(O,) the keyframe's feature, (O,) the frame, (O, 2) the pixel there and (O,) its sigma."""
     rows, views, px, sigma = [], [], [], []
     for number, view in enumerate(others):
-        pairs = match(hamming(own.descriptors, view.features.descriptors), MATCH_BITS, MATCH_RATIO)
+        pairs = match(own.descriptors, view.features.descriptors, MATCH_BITS, MATCH_RATIO)
         rows.append(pairs[:, 0])
         views.append(np.full(len(pairs), number))
         px.append(view.features.px[pairs[:, 1]])

@@ -2,7 +2,7 @@
 
 The camera's six degrees of freedom are adjusted, with height and tilt held near the road; the covariance is that of
 (x, y, yaw) with the others marginalised. Each residual is weighed by the corner's own noise and by the uncertain depth
-of its point, as seen from here.
+of its point, as seen from here; the depth is profiled out, each match having its own.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from birdslam.geometry.arrays import Bools, Floats, Ints
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import rotation_exp
 from birdslam.geometry.se2 import SE2
-from birdslam.loops.features import Features, hamming, match, match_near
+from birdslam.loops.features import Features, match, match_near
 from birdslam.loops.foot import body_pose, foot
 from birdslam.loops.keyframe import Keyframe
 from birdslam.loops.triangulation import cross
@@ -107,7 +107,7 @@ def locate(
     if len(features) < 8 or len(local.points_m) < 8:
         return None
     if guess is None:
-        pairs = match(hamming(local.descriptors, features.descriptors), MATCH_BITS, MATCH_RATIO)
+        pairs = match(local.descriptors, features.descriptors, MATCH_BITS, MATCH_RATIO)
         pose, pairs = _ransac(camera, features, local, pairs)
     else:
         pose = ego_pose(guess, Attitude())
@@ -216,6 +216,18 @@ def _guided(camera: Camera, features: Features, local: LocalMap, pose: Transform
     return np.column_stack([rows[pairs[:, 0]], pairs[:, 1]])
 
 
+def _of_a_step(p_ego: Floats, mount: Transform) -> Floats:
+    """(N, 2, 6) of the image coordinates of points (N, 3) in the ego's frame, by a step of the ego in its own frame."""
+    R_cam_ego = mount[:3, :3].T
+    p = (p_ego - mount[:3, 3]) @ R_cam_ego.T
+    z = np.maximum(p[:, 2], 0.3)
+    J_ego = np.zeros((len(p), 3, 6))
+    J_ego[:, :, :3], J_ego[:, :, 3:] = -np.eye(3), cross(p_ego)
+    J_cam = R_cam_ego @ J_ego
+    J: Floats = (J_cam[:, :2] - (p[:, :2] / z[:, None])[:, :, None] * J_cam[:, 2:3]) / z[:, None, None]
+    return J
+
+
 def _adjust(matches: _Matches, pose: Transform, width: float = math.inf) -> _Pose | None:
     """Gauss-Newton from a pose, with weights of Geman and McClure.
 
@@ -240,14 +252,15 @@ def _adjust(matches: _Matches, pose: Transform, width: float = math.inf) -> _Pos
         p = (p_ego - mount[:3, 3]) @ R_cam_ego.T
         z = np.maximum(p[:, 2], 0.3)
         predicted = p[:, :2] / z[:, None]
-        J_ego = np.zeros((len(p), 3, 6))  # of p_ego, by a step of the ego in its own frame
-        J_ego[:, :, :3], J_ego[:, :, 3:] = -np.eye(3), cross(p_ego)
-        J_cam = R_cam_ego @ J_ego
-        J = (J_cam[:, :2] - predicted[:, :, None] * J_cam[:, 2:3]) / z[:, None, None]
-        depth = along @ pose[:3, :3] @ R_cam_ego.T  # its sigma, in this camera's axes
-        blur = (depth[:, :2] - predicted * depth[:, 2:3]) / z[:, None]
-        W = np.linalg.inv(noise[:, None, None] * np.eye(2) + blur[:, :, None] * blur[:, None, :])
+        along_cam = along @ pose[:3, :3] @ R_cam_ego.T
+        blur = (along_cam[:, :2] - predicted * along_cam[:, 2:3]) / z[:, None]  # 1-sigma of the depth, in this image
         error = xy - predicted
+        # J at the depth that the match makes likeliest: at the map's own, whose error is in `error` too, it would
+        # attenuate how far the ego is aside (errors in variables, Fuller 1987)
+        sigmas = (blur * error).sum(axis=1) / (noise + (blur**2).sum(axis=1))
+        q_ego = p_ego + np.clip(sigmas, -GATE, GATE)[:, None] * (along @ pose[:3, :3])
+        J = _of_a_step(q_ego, mount)
+        W = np.linalg.inv(noise[:, None, None] * np.eye(2) + blur[:, :, None] * blur[:, None, :])
         chi2 = (error * (W @ error[:, :, None])[:, :, 0]).sum(axis=1)
         good = (chi2 < GATE**2) & (p[:, 2] > 0.5)
         width = max(min(width / NARROWER, float(np.median(chi2))), NARROWEST)

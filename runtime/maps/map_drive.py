@@ -76,6 +76,10 @@ class MapDrive:
         """Goes on where the process before this one had come to."""
         self._session.resume(pose)
 
+    def due(self, estimate: Estimate) -> bool:
+        """Whether the image of the next frame is looked at."""
+        return self._session.due(estimate)
+
     def step(self, estimate: Estimate, image: NDArray[np.uint8] | None) -> Localisation:
         """One frame, undistorted; None: it is not looked at. One that comes again, corrected, has its row already."""
         if self._begin_ns is None:

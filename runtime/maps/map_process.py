@@ -49,7 +49,9 @@ HEALTH_NS = 1_000_000_000
 WAITING_ESTIMATES = 1024  # while a loop is closed
 HELD_MIB = 8.0, 46.0  # of small objects and of others: WAITING_ESTIMATES as bytes, 10 kB each, and what a look needs
 WAITING_IMAGES = 4  # of frames whose estimates have not come yet: the oldest, however late estimates are
-CPU_SHARE = 0.5  # of one core, that looking at images may take in the long run; odometry carries the frames between
+# Of one core, that looking at images may take in the long run; odometry carries the frames between. What it takes the
+# frames feel, whatever its priority: caches and memory are shared
+CPU_SHARE = 0.25
 SAVE_EVERY_S, SAVE_SHARE = 10.0, 0.02  # and a large map so seldom that writing it takes no more of the time
 NICENESS = 10  # all others go first
 SUMMARY = "map.json"  # beside the logs: what the supervisor puts into summary.json
@@ -144,8 +146,9 @@ class LiveMap:
             frame_id, pixels = self._images.popitem(last=False)
             image = pixels if frame_id == estimate.frame_id else None
         begun_s = time.process_time()
-        found = self._drive.step(estimate, None if image is None else self._undistort(image))
-        if image is not None:
+        looked = image is not None and self._drive.due(estimate)
+        found = self._drive.step(estimate, self._undistort(image) if image is not None and looked else None)
+        if looked:
             took_ns = (time.process_time() - begun_s) * 1e9
             self._next_look_ns = estimate.t_capture_ns + round(took_ns / CPU_SHARE)
             self.looks += 1

@@ -29,7 +29,7 @@ class FixedPatternConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     on_threshold: Positive = 0.32  # correlation of equal pixels, above which there is a pattern
     off_threshold: Positive = 0.22  # correlation below which there is none any more
     min_baseline_m: Positive = 0.5  # driven between the two images
-    memory_m: Positive = 40.0  # driven, over which the mean goes: more than an image shows of the road
+    memory_m: Positive = 20.0  # driven, over which the mean goes: as much as an image shows of the road
     judged_images: Annotated[int, msgspec.Meta(ge=1)] = 5  # time constant of the correlation's mean
     # Judged to be without a pattern, until one that is found must have come: one that was there is found in six
     absent_images: Annotated[int, msgspec.Meta(ge=1)] = 10

@@ -246,7 +246,7 @@ class RoadScale:
         out: list[Status] = []
         if not self._sees_road() and not self._car.measures:
             out.append(Status.SCALE_CARRIED)
-        if self.unknown:
+        if self.unknown or self._confirmation.outweighed:
             out.append(Status.SCALE_INVALID)
         if self._confirmation.violated:
             out.append(Status.GROUND_VIOLATED)
@@ -303,10 +303,12 @@ class RoadScale:
         expected = searched != 1.0 or not known or filter_.innovation(fit)[2] < cfg.max_innovation_sigma
         least = cfg.min_correlation
         told = fit.length_information > cfg.doubt_sigma_rel**-2  # far likelier than other lengths
-        if told or agrees(float(np.log(searched)) + fit.state[0], by_landmarks):
+        log_length = float(np.log(searched)) + float(fit.state[0])
+        found_before = searched != 1.0 and confirmation.found_before(log_length)
+        if told or found_before or agrees(log_length, by_landmarks):
             least *= _AGREED_CORRELATION_SHARE
         if fit.correlation < least or not expected:
-            confirmation.reject(new)
+            confirmation.reject(new, log_length if searched != 1.0 else None)
             return 1.0
         shown = confirmation.mean_information(fit.length_information)
         if not agrees(float(np.log(searched)) + filter_.length(fit)[0], by_landmarks):

@@ -7,6 +7,9 @@ from birdslam.odometry.scale_config import RoadScaleConfig
 TOLD = 0.5  # of an alignment's information about the length (kalman_filter.py): with more it counts as told
 _COMPARISONS = 5  # time constant of the mean of what they tell
 _ANOTHER_LOG = 0.3  # of the factor on the length by an alignment: a larger one begins the row anew
+_MOST_AGAINST = 10.0  # alignments that agreed on the length before, which as many must outweigh
+_REMEMBERED, _FOUND = 20, 2  # rejected alignments, and how many of them must have found the same length
+_SAME_LOG = 0.2  # of two lengths that are the same
 
 
 class ScaleConfirmation:
@@ -15,8 +18,10 @@ class ScaleConfirmation:
     def __init__(self, config: RoadScaleConfig) -> None:
         self.config = config
         self._told = 0.0  # by alignments in a row, each 0 to 1
+        self._against = 0.0  # told of another length by those in a row before
         self._rejected = 0.0  # in a row, each by its new share of the path: those of one view err together
         self.rejections = 0  # their number
+        self._found: list[float | None] = []  # logs of the length that they found by a search, None: none
         self._mean, self._comparisons = 0.0, 0  # mean information of comparisons about the length, and their number
 
     @property
@@ -28,6 +33,14 @@ class ScaleConfirmation:
     def known(self) -> bool:
         """Whether enough have."""
         return self._told > self.config.confirmations - TOLD
+
+    @property
+    def outweighed(self) -> bool:
+        """Whether more have agreed on another length just before.
+
+        Where the motion's direction is wrong no right length correlates, and a false one may for a while.
+        """
+        return self._told < self._against
 
     @property
     def contradicted(self) -> bool:
@@ -46,12 +59,19 @@ class ScaleConfirmation:
 
     def forget(self) -> None:
         """The length is unknown."""
-        self._told = 0.0
+        self._told = self._against = 0.0
+        self._found = []
 
-    def reject(self, new: float) -> None:
-        """An alignment was rejected, of which this share of the path is new."""
+    def reject(self, new: float, found_log: float | None = None) -> None:
+        """An alignment was rejected, of which this share of the path is new; `found_log` by a search."""
         self._rejected += new
         self.rejections += 1
+        self._found = [*self._found[1 - _REMEMBERED :], found_log]
+
+    def found_before(self, log_length: float) -> bool:
+        """Whether rejected alignments had found this length in the present unit: one may by chance."""
+        agree = [log for log in self._found if log is not None and abs(log - log_length) < _SAME_LOG]
+        return len(agree) >= _FOUND
 
     def mean_information(self, information: float) -> float:
         """The mean of what comparisons tell with this one: by chance a single one may look like information."""
@@ -62,9 +82,12 @@ class ScaleConfirmation:
     def agree(self, tells: float) -> None:
         """An alignment agrees and tells so much of the length, 0 to 1: it ends a row of rejections by as much."""
         self._rejected *= 1.0 - tells
+        self._found = []  # the unit changes
         if tells >= TOLD:
             self.rejections = 0
 
     def confirm(self, tells: float, log_factor: float) -> None:
         """It has changed the length by this factor."""
-        self._told = tells if abs(log_factor) > _ANOTHER_LOG else self._told + tells
+        if abs(log_factor) > _ANOTHER_LOG:
+            self._against, self._told = min(self._told, _MOST_AGAINST), 0.0
+        self._told += tells
