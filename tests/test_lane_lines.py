@@ -188,6 +188,35 @@ def test_lines_over_a_crest_and_through_a_sag(vertical_per_m: float) -> None:
     assert bends[-1] == pytest.approx(vertical_per_m, abs=4e-4)
 
 
+@pytest.mark.parametrize("told", [1.0, 0.75])  # of the focal length
+def test_lines_of_a_bend_through_a_sag_do_not_meet(told: float) -> None:
+    # Far on a bend a pixel's row moves paint by more than its column: such paint bent the road upwards or downwards
+    bend, sag, rng = 0.012, 1.3e-3, np.random.default_rng(0)
+    camera = msgspec.structs.replace(CAMERA, fx_px=told * CAMERA.fx_px, fy_px=told * CAMERA.fy_px)
+    tracker, T_world_told, last, x_m = LineTracker(camera), SE2(), SE2(), 0.0
+    off, inside = [], []
+    while x_m < 48.0:
+        pose = SE2(x_m, 0.5 * bend * x_m**2, math.atan(bend * x_m))
+        step, last = last.between(pose), pose
+        # What an odometry with that focal length sees of it
+        T_world_told @= SE2(told * step.x_m, step.y_m, step.yaw_rad / told)
+        ground = GroundPlane(CAMERA.height_m, 0.5 * sag * PLANE_AT_M / told + rng.normal(0.0, 0.002))
+        image, masks = picture(pose, (1.75, -1.75), (True, False), bend, vertical_per_m=sag)
+        tracker.update(T_world_told, ground, (0.003, 0.01), image, masks, NOBODY)
+        for found in tracker.lines().at(T_world_told) if x_m > 12.0 else ():
+            if found.kind is not LineKind.EDGE:
+                world_x = np.linspace(x_m, x_m + 60.0, 400)
+                y_m = [
+                    np.interp(28.0, *(pose.inverse() @ np.column_stack([world_x, y + 0.5 * bend * world_x**2])).T)
+                    for y in (1.75, -1.75)
+                ]
+                off.append(min(abs(found.y_m(28.0 * told) - y) for y in y_m))
+                inside.append(off[-1] < 2.0 * found.sigma_m(28.0 * told))
+        x_m += float(rng.choice([1.0, 2.0, 3.0, 4.0]))
+    assert np.median(off) < 0.25
+    assert np.mean(inside) > 0.95
+
+
 def test_a_direction_of_travel_that_is_off_for_long_does_not_drag_lines_along() -> None:
     tracker, off, sigmas = LineTracker(CAMERA), [], []
     for k in range(24):

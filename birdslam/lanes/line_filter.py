@@ -196,9 +196,11 @@ class LineFilter:
         for _ in range(ITERATIONS):
             curves, tilt = state[COMMON:-1].reshape(count, 4), Tilt(float(state[-1]), float(state[VERTICAL]))
             x, y = tilt.applied(points.x_m, points.y_m, height_m)
-            owner = self._owners(x, y, points, curves, of, classes)
+            by_ray = _by_ray(x, y, curves, _fall(x, height_m, tilt.vertical_per_m))
+            sigma = np.hypot(points.sigma_m[:, None], by_ray * points.sigma_ray_rad[:, None])
+            owner = self._owners(x, y, points, sigma, curves, of, classes)
             witness = (classes == 0) | level
-            H, r, variance = _bins(x, y, points, owner, curves, witness, _fall(x, height_m, tilt.vertical_per_m))
+            H, r, variance = _bins(x, y, points.weight, owner, curves, witness, by_ray, sigma)
             H[:, VERTICAL] *= not level
             robust = 1.0 / (1.0 + r**2 / variance / KERNEL_SIGMAS**2)
             scaled = H * (robust / (variance * inflation))[:, None]
@@ -211,7 +213,9 @@ class LineFilter:
         self.cov = 0.5 * (cov + cov.T)[:-1, :-1]
         return seen, Tilt(float(state[-1]), float(self.common[VERTICAL]))
 
-    def _owners(self, x: Floats, y: Floats, points: LinePoints, curves: Floats, of: Ids, classes: Ids) -> Ints:
+    def _owners(
+        self, x: Floats, y: Floats, points: LinePoints, sigma: Floats, curves: Floats, of: Ids, classes: Ids
+    ) -> Ints:
         """(N,) the line that each point is on, -1: none. Of two ridges of a row one alone is the line.
 
         It is the one that a network's mask has, and of such the nearest: kerbstones, joints and rails run beside paint.
@@ -220,7 +224,7 @@ class LineFilter:
         gap = np.abs(y[:, None] - at @ curves.T)
         blocks = np.stack([self.block(k) for k in range(len(curves))])
         spread = np.sqrt(np.maximum(((at @ blocks) * at).sum(axis=2), 0.0)).T
-        gate = np.clip(GATE_SIGMAS * np.hypot(spread, points.sigma_m[:, None]), LEAST_GATE_M, WIDEST_GATE_M)
+        gate = np.clip(GATE_SIGMAS * np.hypot(spread, sigma), LEAST_GATE_M, WIDEST_GATE_M)
         gap = np.where((gap < gate) & (of[:, None] == classes[None]), gap, np.inf)
         nearest = np.argmin(gap, axis=1)
         off = gap[np.arange(len(x)), nearest]
@@ -240,23 +244,31 @@ def _fall(x_m: Floats, height_m: float, vertical_per_m: float) -> Floats:
     return out
 
 
+def _by_ray(x: Floats, y: Floats, curves: Floats, fall: Floats) -> Floats:
+    """(N, n) how far points move across each curve when the slopes of their rays grow: they come nearer, and inwards.
+
+    `fall` (N,) is how steeply the rays meet the road. So a pixel's row is more than its column where lines bend.
+    """
+    out: Floats = ((slope_basis(x) @ curves.T) * x[:, None] - y[:, None]) / fall[:, None]
+    return out
+
+
 def _bins(
-    x: Floats, y: Floats, points: LinePoints, owner: Ids, curves: Floats, witness: Bools, fall: Floats
+    x: Floats, y: Floats, weight: Floats, owner: Ids, curves: Floats, witness: Bools, by_ray: Floats, sigma: Floats
 ) -> tuple[Floats, Floats, Floats]:
     """The observations, one for a metre of a line: H (B, 2 + 4 n + 1), residuals (B,) and variances (B,).
 
-    `witness` (n,) are the lines that say how the road lies, `fall` (N,) is how steeply the points' rays meet it.
+    `witness` (n,) are the lines that say how the road lies; `by_ray`, `sigma` (N, n) of each point against each line.
     """
     on = np.flatnonzero(owner >= 0)
-    line, x, y, sigma = owner[on], x[on], y[on], points.sigma_m[on]
+    line, x, y = owner[on], x[on], y[on]
+    sigma = sigma[on, line]
     key, index = np.unique(line * _CELLS + np.floor(x / BIN_M).astype(np.int64) % _CELLS, return_inverse=True)
     counts = np.bincount(index, minlength=len(key))
-    weight = points.weight[on] / sigma**2
+    weight = weight[on] / sigma**2
     total = np.bincount(index, weight, len(key))
-    at, curve = basis(x), curves[line]
-    residual = y - (at * curve).sum(axis=1)
-    slope = (slope_basis(x) * curve).sum(axis=1)
-    by_tilt = np.where(witness[line], (slope * x - y) / fall[on], 0.0)
+    residual = y - (basis(x) * curves[line]).sum(axis=1)
+    by_tilt = np.where(witness[line], by_ray[on, line], 0.0)
     x_bin, r, tilt = (np.bincount(index, weight * value, len(key)) / total for value in (x, residual, by_tilt))
     variance = np.bincount(index, sigma**2, len(key)) / counts / np.minimum(counts, MOST_IN_BIN) + SIGMA_BIN_M**2
     H = np.zeros((len(key), COMMON + 4 * len(curves) + 1))

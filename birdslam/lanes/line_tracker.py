@@ -7,7 +7,7 @@ says where each is, and only what lies on no known line can be a new one.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import msgspec
 import numpy as np
@@ -333,8 +333,7 @@ def _explained_m(paint: LinePoints, tracks: list[Track], seen: list[Support]) ->
 
 
 def _joined(*parts: LinePoints) -> LinePoints:
-    names = ("x_m", "y_m", "sigma_m", "weight", "masked", "yellow")
-    return LinePoints(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+    return LinePoints(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(LinePoints)))
 
 
 def still_lines(

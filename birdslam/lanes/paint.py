@@ -7,7 +7,7 @@ lines; where it is coarser than the image, the ridge says where the line is. Edg
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
@@ -48,8 +48,9 @@ EDGE_PIXELS = 3.0  # sigma of a mask's border in pixels: networks see a half or 
 
 @dataclass(frozen=True)
 class LinePoints:
-    """N points in ego: `x_m`, `y_m`, 1-sigma across `sigma_m`, evidence `weight` (metres of road, at most the row's).
+    """N points in ego: `x_m`, `y_m`, evidence `weight` (metres of road, at most the row's).
 
+    1-sigma: `sigma_m` across the road, and `sigma_ray_rad` of the slope of the ray, which says how far away it is.
     `masked`: a network's mask has it. `yellow`: its excess of yellow over the road's, NaN of a grey image.
     """
 
@@ -59,14 +60,14 @@ class LinePoints:
     weight: Floats
     masked: Bools
     yellow: Floats
+    sigma_ray_rad: Floats
 
     def __len__(self) -> int:
         return len(self.x_m)
 
     def of(self, chosen: Bools | Ints) -> LinePoints:
         """Some of them."""
-        fields = (self.x_m, self.y_m, self.sigma_m, self.weight, self.masked, self.yellow)
-        return LinePoints(*(field[chosen] for field in fields))  # type: ignore[arg-type]
+        return LinePoints(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
     def tilted(self, height_m: float, by_rad: float, vertical_per_m: float = 0.0) -> LinePoints:
         """The points if the camera's nose is lower by `by_rad`, on a road of that vertical curvature."""
@@ -101,6 +102,7 @@ def paint_points(view: RoadView) -> LinePoints:
         np.minimum(view.row_m[rows], MOST_ROW_M) * np.where(masked, 1.0, UNSEEN_WEIGHT),
         masked,
         yellow,
+        share * view.pixel_rad,
     )
 
 
@@ -272,7 +274,13 @@ def edge_points(view: RoadView, middle_m: Floats) -> tuple[LinePoints, LinePoint
         nothing = np.full(len(kept), np.nan)
         out.append(
             LinePoints(
-                view.x_m[kept], y_m, sigma, np.minimum(view.row_m[kept], MOST_ROW_M), np.ones(len(kept), bool), nothing
+                view.x_m[kept],
+                y_m,
+                sigma,
+                np.minimum(view.row_m[kept], MOST_ROW_M),
+                np.ones(len(kept), bool),
+                nothing,
+                np.full(len(kept), EDGE_PIXELS * view.pixel_rad),
             )
         )
     return out[0], out[1]

@@ -39,6 +39,7 @@ class RoadView:
     y_m: Floats
     row_m: Floats  # (R,) the length of road that a row stands for
     sigma_y_m: Floats  # (R,) one pixel across the road
+    pixel_rad: float  # one pixel, of a ray's slope
     grey: Grid
     road: Bools
     paint: Bools
@@ -108,6 +109,7 @@ def road_view(
         y_m,
         row_m,
         x_m / camera.fx_px,
+        1.0 / camera.fy_px,
         np.asarray(grey, np.float32),
         road & ~outside,
         paint & ~outside & ~hidden,
