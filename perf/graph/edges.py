@@ -25,11 +25,13 @@ from birdslam.bench.ego.motion_consistency import moved_by_turn
 from birdslam.bench.ego.truth_quality import AXES_SIGMA_RAD
 from birdslam.bench.figures import markdown
 from birdslam.bench.simulation.edge_statistics import EdgeStatistics, edge_statistics
+from birdslam.bench.simulation.landmark_errors import LandmarkErrors, landmark_errors
 from birdslam.bench.simulation.odometry import SimulatedOdometry, SimulationConfig
 from birdslam.bench.tracking.benchmark import LEAST_FRAMES, Live, Truth, inflated, make_log, ours
 from birdslam.bench.tracking.localisation import CAMERA_OF_BOXES
 from birdslam.bench.tracking.metrics import path_errors
 from birdslam.geometry.arrays import Floats
+from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.factors.factor import Factor
 from birdslam.graph.factors.standard import standard_factors
@@ -177,6 +179,7 @@ class Case:
     name: str
     log: list[Measurements]
     ego: dict[int, SE2]
+    camera: Camera
     truth: Truth | None
     axes_rad: float = 0.0
 
@@ -185,17 +188,17 @@ def recorded(name: str, data: Path, logs: Path, configuration: Configuration) ->
     """A clip's log of its images: the one in `logs`, or recorded anew and put there."""
     folder, left_out = CLIPS[name]
     log = log_of(str(data / folder), logs / f"{name}.log", configuration)[left_out:]
+    recording = open_recording(f"kitti:{data / folder}")
     if folder.startswith(TRACKING):
         truth = Truth.of(open_tracking(data / TRACKING, name), log)
-        return Case(name, log, truth.ego, truth, AXES_SIGMA_RAD)
-    recording = open_recording(f"kitti:{data / folder}")
+        return Case(name, log, truth.ego, recording.camera, truth, AXES_SIGMA_RAD)
     poses = recording.truth_poses()
     assert poses is not None, name
     T_cam0_cam, mount = recording.T_cam0_cam(), mount_pose(recording.camera.ground)
     camera = inverse(T_cam0_cam) @ as_poses(poses) @ T_cam0_cam
     first = inverse(camera[log[0].frame_id])
     ego = {m.frame_id: split_pose(mount @ first @ camera[m.frame_id] @ inverse(mount))[0] for m in log}
-    return Case(name, log, ego, None, AXES_SIGMA_RAD)
+    return Case(name, log, ego, recording.camera, None, AXES_SIGMA_RAD)
 
 
 def log_of(drive: str, path: Path, configuration: Configuration) -> list[Measurements]:
@@ -230,7 +233,7 @@ def simulated(name: str, data: Path, seed: int) -> Case:
     frames = range(min(150, len(sequence)))
     log = make_log(sequence, frames, odometry, given, None, SlamConfig().frontend)
     truth = Truth.of(sequence, log)
-    return Case(f"{name}, seed {seed}", log, truth.ego, truth)
+    return Case(f"{name}, seed {seed}", log, truth.ego, sequence.camera, truth)
 
 
 # --- grades ---
@@ -295,12 +298,14 @@ def _nees(error: Floats, cov: Floats) -> float:
 
 
 def statistics_table(cases: Sequence[Case]) -> str:
-    """A row for each log: what its CC and CP edges are worth."""
-    fields, lines = EdgeStatistics.__struct_fields__, []
+    """A row for each log: what its CC and CP edges are worth, and what its landmarks err by."""
+    of_edges, of_landmarks = EdgeStatistics.__struct_fields__, LandmarkErrors.__struct_fields__
+    lines = []
     for case in cases:
-        found = edge_statistics(case.log, case.ego)
-        lines.append([case.name, *("-" if found is None else f"{getattr(found, name):.3g}" for name in fields)])
-    return markdown(["log", *(name.replace("_", " ") for name in fields)], lines)
+        edges, landmarks = edge_statistics(case.log, case.ego), landmark_errors(case.log, case.ego, case.camera)
+        cells = [(edges, name) for name in of_edges] + [(landmarks, name) for name in of_landmarks]
+        lines.append([case.name, *("-" if of is None else f"{getattr(of, name):.3g}" for of, name in cells)])
+    return markdown(["log", *(name.replace("_", " ") for name in (*of_edges, *of_landmarks))], lines)
 
 
 def case_parser(name: str, what: str) -> ArgumentParser:
