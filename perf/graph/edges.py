@@ -1,6 +1,6 @@
 """What each edge of the graph is worth: the ego's and vehicles' errors with each left out, alone, halved and doubled.
 
-    python -m perf edges --logs DIR [--model ROLE=PATH ...] [--clips 0005,0002] [--seeds 3] [--output FILE]
+    python -m perf edges --logs DIR [--model ROLE=PATH ...] [--clips 0005,0002] [--seeds 3] [--draws 20] [--output FILE]
 
 Logs of images are recorded once by the whole front end and kept in DIR; simulated ones are made anew. ATE in m, nothing
 aligned; NEES over its degrees of freedom, the ego's in the world, also beside the error of the true poses' axes, a
@@ -38,7 +38,7 @@ from birdslam.graph.factors.standard import standard_factors
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.paper import NO_GATE
 from birdslam.perception import Pending, Perception, Ready
-from birdslam.perf.graph.edges_table import left_out, table
+from birdslam.perf.graph.edges_table import left_out, nees_spread, table
 from birdslam.perf.reporting.arguments import add_data, benchmark_parser
 from birdslam.perf.reporting.figures import write_json
 from birdslam.runtime.batch.offline import pipeline
@@ -65,6 +65,7 @@ CLIPS = {  # folder, and how many frames are left out at its beginning
 }
 SIMULATED = ("0002", "0003", "0005", "0018")  # sequences whose true poses and boxes simulated drives take
 EGO_DIMENSIONS, PLACE = 3, 2
+FIRST_DRAW = 100  # its seed: none of the table's
 SURELY, VEHICLE_IDS = 0.95, 1 << 36  # a vehicle stands; its number among landmarks
 Change = Callable[[Measurements], Measurements]
 
@@ -278,6 +279,13 @@ def grade(variant: Variant, case: Case) -> dict[str, float]:
     return out
 
 
+def nees_of_draws(data: Path, draws: int) -> list[float]:
+    """The default's NEES of the ego in `draws` simulated drives of each sequence: what one drive of many may have."""
+    default = variants()["default"]
+    seeds = range(FIRST_DRAW, FIRST_DRAW + draws)
+    return [grade(default, simulated(name, data, seed))["NEES of the ego"] for name in SIMULATED for seed in seeds]
+
+
 def _nees_of_cars(graph: PoseGraph, m: Measurements, truth: Truth) -> list[float]:
     estimated, out = graph.vehicles_in_ego(), []
     for car, vehicle in truth.matches[m.frame_id].items():
@@ -331,7 +339,9 @@ def cases_of(options: Namespace, configuration: Configuration) -> tuple[list[Cas
 
 
 def run(arguments: list[str]) -> None:
-    options = case_parser("edges", label).parse_args(arguments)
+    parser = case_parser("edges", label)
+    parser.add_argument("--draws", type=int, default=20, help="of each simulated drive, for the spread of the NEES")
+    options = parser.parse_args(arguments)
     output, options.output = options.output, None  # of the benchmark, not of a drive
     cases, drives = cases_of(options, configuration_of(options))
     for case in cases:
@@ -351,6 +361,9 @@ def run(arguments: list[str]) -> None:
     left = {what: left_out(grades, what) for what in ("ego", "cars, live", "cars, final")}
     for what, lines in left.items():
         print(f"\nBest on the others, {what}, left one out:", *lines, sep="\n  ")
+    spread = nees_spread(nees_of_draws(options.data, options.draws)) if options.draws else ""
+    print(f"\n{spread}")
     if output is not None:
         kept = {"statistics": statistics_table([*cases, *drives]), "table": table(grades, drawn), "left": left}
+        kept["nees"] = spread
         write_json(output, kept | {"grades": grades})
