@@ -10,7 +10,8 @@ from msgspec.structs import replace
 
 from birdslam.bench.simulation.drive import DriveConfig, drive
 from birdslam.bench.simulation.edge_statistics import SPAN, EdgeStatistics, edge_statistics
-from birdslam.bench.simulation.odometry import EXACT, SimulatedOdometry, SimulationConfig
+from birdslam.bench.simulation.landmark_errors import LandmarkErrors, landmark_errors
+from birdslam.bench.simulation.odometry import EXACT, Drift, SimulatedOdometry, SimulationConfig
 from birdslam.bench.tracking.benchmark import make_log
 from birdslam.frontend import FrontEndConfig
 from birdslam.geometry.se2 import SE2
@@ -37,6 +38,15 @@ REAL = EdgeStatistics(
     common_along_m=0.291,
     common_across_m=0.051,
 )
+
+# What landmarks of KITTI tracking 0005 and 0002 and odometry 00 err by (`python -m perf edges`)
+REAL_LANDMARKS = {
+    "pitch_mrad": (5.0, 4.1, 5.1),
+    "pitch_later": (0.36, 0.79, 0.71),
+    "roll_mrad": (10.7, 7.6, 11.0),
+    "roll_later": (0.32, 0.32, 0.86),
+    "own_px": (0.82, 0.68, 0.75),
+}
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +79,40 @@ def test_simulated_edges_are_worth_what_real_ones_are(sequence: TrackingSequence
     # A landmark knows less of a way's length than the odometry does: this is why CP is worth so little
     assert mean("cp") > 2.0 * mean("cc")
     assert abs(mean("seen") - REAL.seen) < 2.0 * REAL.seen_sigma
+
+
+def test_simulated_landmarks_err_as_real_ones(sequence: TrackingSequence) -> None:
+    """The mean of four drives is within a quarter of what three real ones show: pitch, roll, and how long they last."""
+    ego = dict(enumerate(sequence.ego_truth(0)))
+    drawn = [landmark_errors(simulated(sequence, SimulationConfig(), seed), ego, sequence.camera) for seed in range(4)]
+    for name, real in REAL_LANDMARKS.items():
+        found = float(np.mean([getattr(one, name) for one in drawn]))
+        assert 0.75 * min(real) < found < 1.25 * max(real), name
+
+
+def test_what_landmarks_err_by_is_found_whatever_the_axes_of_the_poses(sequence: TrackingSequence) -> None:
+    """Pitch, roll and own errors of the sizes that were put in; true poses whose axes are off change none."""
+    noise = replace(
+        EXACT.noise,
+        landmark_pitch_rad=Drift(0.0, 0.004, 20.0),
+        landmark_roll_rad=Drift(0.0, 0.012, 20.0),
+        landmark_px=0.2,
+        landmarks=40.0,
+    )
+    logs = [simulated(sequence, replace(EXACT, noise=noise), seed) for seed in range(4)]
+    ego = dict(enumerate(sequence.ego_truth(0)))
+    off = SE2(yaw_rad=0.01)  # between the axes of the true poses and the car's
+    turned = {frame: T @ off for frame, T in ego.items()}
+    for poses in (ego, turned):
+        found = [landmark_errors(log, poses, sequence.camera) for log in logs]
+
+        def mean(name: str, found: list[LandmarkErrors | None] = found) -> float:
+            return float(np.mean([getattr(one, name) for one in found]))
+
+        assert mean("pitch_mrad") == pytest.approx(4.0, rel=0.3)
+        assert mean("roll_mrad") == pytest.approx(12.0, rel=0.3)
+        assert min(mean("pitch_later"), mean("roll_later")) > 0.6
+        assert mean("own_px") == pytest.approx(0.2, rel=0.4)
 
 
 def test_exact_edges_have_no_error(sequence: TrackingSequence) -> None:

@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 
 from birdslam.bench.ego.trajectory_errors import from_first
 from birdslam.bench.simulation.odometry import OdometryNoise, fit_drift
-from birdslam.geometry import bev
 from birdslam.geometry.arrays import Floats, Ints
 from birdslam.odometry.motion import Motion
 from birdslam.odometry.odometry import Odometry
@@ -46,14 +45,13 @@ def run(arguments: list[str]) -> None:
 def fit(clips: list[tuple[Recording, int]]) -> OdometryNoise:
     """The noise of all clips together."""
     cv2.setNumThreads(1)
-    series, lives, counts, spreads_px = [], [], [], []
+    series, lives, counts = [], [], []
     for recording, left_out in clips:
-        rows, tracks, spread_px = measure(recording, left_out)
+        rows, tracks = measure(recording, left_out)
         series.append(rows)
         ids, seen = np.unique(np.concatenate([ids for ids, _ in tracks]), return_counts=True)
         lives.append(len(ids) and seen.mean())
         counts.append(np.mean([len(ids) for ids, _ in tracks]))
-        spreads_px.append(spread_px)
     of = {name: [rows[:, k] for rows in series] for k, name in enumerate(COLUMNS)}
     even = [np.ones(len(rows)) for rows in series]
     true_turn, turn, side, step = (np.concatenate(of[name]) for name in ("true_turn", "turn", "side", "step_m"))
@@ -75,18 +73,17 @@ def fit(clips: list[tuple[Recording, int]]) -> OdometryNoise:
         ground_rad=fit_drift(pitch, [np.ones(len(rows)) for rows in pitch]),
         landmarks=LANDMARKS_SHARE * float(np.median(counts)),
         landmark_frames=float(np.median(lives)),
-        landmark_px=float(np.median(spreads_px)),
     )
 
 
-def measure(recording: Recording, left_out: int) -> tuple[Floats, list[tuple[Ints, Floats]], float]:
-    """The errors (N, len(COLUMNS)), the road tracks of each frame, and how far they scatter (px)."""
+def measure(recording: Recording, left_out: int) -> tuple[Floats, list[tuple[Ints, Floats]]]:
+    """The errors (N, len(COLUMNS)), and the road tracks of each frame."""
     odometry = Odometry(recording.camera)
     T_cam0_cam = recording.T_cam0_cam()
     truth = recording.truth_poses()
     assert truth is not None, recording.name
     poses = from_first(inverse(T_cam0_cam) @ as_poses(truth) @ T_cam0_cam)
-    rows, tracks, gaps_px = [], [], []
+    rows, tracks = [], []
     for frame in recording.frames():
         assert frame.image is not None, frame.error
         motion = odometry.estimate(odometry.track(frame.image), frame.index, frame.t_source_ns, np.zeros((0, 4)))
@@ -98,10 +95,7 @@ def measure(recording: Recording, left_out: int) -> tuple[Floats, list[tuple[Int
             rows.append(
                 [*_errors(step, motion), motion.ground.pitch_rad - _pitch_rad(poses[motion.to_frame :], recording)]
             )
-            gaps_px.append(_gaps_px(recording, step, motion, tracks[-2], tracks[-1]))
-    gaps = np.concatenate(gaps_px)
-    spread_px = 1.4826 * float(np.median(np.abs(gaps))) / np.sqrt(2.0)  # of one coordinate, seen twice
-    return np.array(rows), tracks[1:], spread_px
+    return np.array(rows), tracks[1:]
 
 
 def _errors(step: Transform, motion: Motion) -> list[float]:
@@ -121,16 +115,3 @@ def _pitch_rad(poses: Transform, recording: Recording) -> float:
     up = np.array([0.0, -1.0, 0.0])
     road = T[:3, 3] - recording.camera.height_m * (T[:3, :3] @ up - up)
     return float(np.arctan2(-road[1], road[2]))
-
-
-def _gaps_px(
-    recording: Recording, step: Transform, motion: Motion, before: tuple[Ints, Floats], after: tuple[Ints, Floats]
-) -> Floats:
-    """Where road tracks are against where their last sight, laid on the road and moved as the camera did, puts them."""
-    _, a, b = np.intersect1d(before[0], after[0], return_indices=True)
-    points = bev.road_point_cam(recording.camera, motion.ground, before[1][a])
-    moved = (points - step[:3, 3]) @ step[:3, :3]
-    px = moved[:, :2] / moved[:, 2:] * [recording.camera.fx_px, recording.camera.fy_px]
-    gaps = px - (after[1][b] - [recording.camera.cx_px, recording.camera.cy_px])
-    gaps = gaps - np.median(gaps, axis=0) if len(gaps) else gaps  # what all have in common is the tilt's
-    return gaps[np.isfinite(gaps)]

@@ -1,6 +1,6 @@
 """What each edge of the graph is worth: the ego's and vehicles' errors with each left out, alone, halved and doubled.
 
-    python -m perf edges --logs DIR [--model ROLE=PATH ...] [--clips 0005,0002] [--seeds 3] [--output FILE]
+    python -m perf edges --logs DIR [--model ROLE=PATH ...] [--clips 0005,0002] [--seeds 3] [--draws 20] [--output FILE]
 
 Logs of images are recorded once by the whole front end and kept in DIR; simulated ones are made anew. ATE in m, nothing
 aligned; NEES over its degrees of freedom, the ego's in the world, also beside the error of the true poses' axes, a
@@ -25,18 +25,20 @@ from birdslam.bench.ego.motion_consistency import moved_by_turn
 from birdslam.bench.ego.truth_quality import AXES_SIGMA_RAD
 from birdslam.bench.figures import markdown
 from birdslam.bench.simulation.edge_statistics import EdgeStatistics, edge_statistics
+from birdslam.bench.simulation.landmark_errors import LandmarkErrors, landmark_errors
 from birdslam.bench.simulation.odometry import SimulatedOdometry, SimulationConfig
 from birdslam.bench.tracking.benchmark import LEAST_FRAMES, Live, Truth, inflated, make_log, ours
 from birdslam.bench.tracking.localisation import CAMERA_OF_BOXES
 from birdslam.bench.tracking.metrics import path_errors
 from birdslam.geometry.arrays import Floats
+from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.factors.factor import Factor
 from birdslam.graph.factors.standard import standard_factors
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.paper import NO_GATE
 from birdslam.perception import Pending, Perception, Ready
-from birdslam.perf.graph.edges_table import left_out, table
+from birdslam.perf.graph.edges_table import left_out, nees_spread, table
 from birdslam.perf.reporting.arguments import add_data, benchmark_parser
 from birdslam.perf.reporting.figures import write_json
 from birdslam.runtime.batch.offline import pipeline
@@ -63,6 +65,7 @@ CLIPS = {  # folder, and how many frames are left out at its beginning
 }
 SIMULATED = ("0002", "0003", "0005", "0018")  # sequences whose true poses and boxes simulated drives take
 EGO_DIMENSIONS, PLACE = 3, 2
+FIRST_DRAW = 100  # its seed: none of the table's
 SURELY, VEHICLE_IDS = 0.95, 1 << 36  # a vehicle stands; its number among landmarks
 Change = Callable[[Measurements], Measurements]
 
@@ -177,6 +180,7 @@ class Case:
     name: str
     log: list[Measurements]
     ego: dict[int, SE2]
+    camera: Camera
     truth: Truth | None
     axes_rad: float = 0.0
 
@@ -185,17 +189,17 @@ def recorded(name: str, data: Path, logs: Path, configuration: Configuration) ->
     """A clip's log of its images: the one in `logs`, or recorded anew and put there."""
     folder, left_out = CLIPS[name]
     log = log_of(str(data / folder), logs / f"{name}.log", configuration)[left_out:]
+    recording = open_recording(f"kitti:{data / folder}")
     if folder.startswith(TRACKING):
         truth = Truth.of(open_tracking(data / TRACKING, name), log)
-        return Case(name, log, truth.ego, truth, AXES_SIGMA_RAD)
-    recording = open_recording(f"kitti:{data / folder}")
+        return Case(name, log, truth.ego, recording.camera, truth, AXES_SIGMA_RAD)
     poses = recording.truth_poses()
     assert poses is not None, name
     T_cam0_cam, mount = recording.T_cam0_cam(), mount_pose(recording.camera.ground)
     camera = inverse(T_cam0_cam) @ as_poses(poses) @ T_cam0_cam
     first = inverse(camera[log[0].frame_id])
     ego = {m.frame_id: split_pose(mount @ first @ camera[m.frame_id] @ inverse(mount))[0] for m in log}
-    return Case(name, log, ego, None, AXES_SIGMA_RAD)
+    return Case(name, log, ego, recording.camera, None, AXES_SIGMA_RAD)
 
 
 def log_of(drive: str, path: Path, configuration: Configuration) -> list[Measurements]:
@@ -230,7 +234,7 @@ def simulated(name: str, data: Path, seed: int) -> Case:
     frames = range(min(150, len(sequence)))
     log = make_log(sequence, frames, odometry, given, None, SlamConfig().frontend)
     truth = Truth.of(sequence, log)
-    return Case(f"{name}, seed {seed}", log, truth.ego, truth)
+    return Case(f"{name}, seed {seed}", log, truth.ego, sequence.camera, truth)
 
 
 # --- grades ---
@@ -275,6 +279,13 @@ def grade(variant: Variant, case: Case) -> dict[str, float]:
     return out
 
 
+def nees_of_draws(data: Path, draws: int) -> list[float]:
+    """The default's NEES of the ego in `draws` simulated drives of each sequence: what one drive of many may have."""
+    default = variants()["default"]
+    seeds = range(FIRST_DRAW, FIRST_DRAW + draws)
+    return [grade(default, simulated(name, data, seed))["NEES of the ego"] for name in SIMULATED for seed in seeds]
+
+
 def _nees_of_cars(graph: PoseGraph, m: Measurements, truth: Truth) -> list[float]:
     estimated, out = graph.vehicles_in_ego(), []
     for car, vehicle in truth.matches[m.frame_id].items():
@@ -295,12 +306,14 @@ def _nees(error: Floats, cov: Floats) -> float:
 
 
 def statistics_table(cases: Sequence[Case]) -> str:
-    """A row for each log: what its CC and CP edges are worth."""
-    fields, lines = EdgeStatistics.__struct_fields__, []
+    """A row for each log: what its CC and CP edges are worth, and what its landmarks err by."""
+    of_edges, of_landmarks = EdgeStatistics.__struct_fields__, LandmarkErrors.__struct_fields__
+    lines = []
     for case in cases:
-        found = edge_statistics(case.log, case.ego)
-        lines.append([case.name, *("-" if found is None else f"{getattr(found, name):.3g}" for name in fields)])
-    return markdown(["log", *(name.replace("_", " ") for name in fields)], lines)
+        edges, landmarks = edge_statistics(case.log, case.ego), landmark_errors(case.log, case.ego, case.camera)
+        cells = [(edges, name) for name in of_edges] + [(landmarks, name) for name in of_landmarks]
+        lines.append([case.name, *("-" if of is None else f"{getattr(of, name):.3g}" for of, name in cells)])
+    return markdown(["log", *(name.replace("_", " ") for name in (*of_edges, *of_landmarks))], lines)
 
 
 def case_parser(name: str, what: str) -> ArgumentParser:
@@ -326,7 +339,9 @@ def cases_of(options: Namespace, configuration: Configuration) -> tuple[list[Cas
 
 
 def run(arguments: list[str]) -> None:
-    options = case_parser("edges", label).parse_args(arguments)
+    parser = case_parser("edges", label)
+    parser.add_argument("--draws", type=int, default=20, help="of each simulated drive, for the spread of the NEES")
+    options = parser.parse_args(arguments)
     output, options.output = options.output, None  # of the benchmark, not of a drive
     cases, drives = cases_of(options, configuration_of(options))
     for case in cases:
@@ -346,6 +361,9 @@ def run(arguments: list[str]) -> None:
     left = {what: left_out(grades, what) for what in ("ego", "cars, live", "cars, final")}
     for what, lines in left.items():
         print(f"\nBest on the others, {what}, left one out:", *lines, sep="\n  ")
+    spread = nees_spread(nees_of_draws(options.data, options.draws)) if options.draws else ""
+    print(f"\n{spread}")
     if output is not None:
         kept = {"statistics": statistics_table([*cases, *drives]), "table": table(grades, drawn), "left": left}
+        kept["nees"] = spread
         write_json(output, kept | {"grades": grades})

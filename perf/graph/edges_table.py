@@ -52,6 +52,16 @@ def table(grades: Mapping[str, Mapping[str, Mapping[str, float]]], drawn: Mappin
     return markdown(["edges", *(title for title, _, _ in columns)], lines)
 
 
+def nees_spread(found: Sequence[float]) -> str:
+    """What the NEES of one drive may be, where the errors are those of the simulation, in a sentence."""
+    low, median, high = np.percentile(found, [2.5, 50.0, 97.5])
+    return (
+        f"One drive is one sample of its NEES, since its errors last: over {len(found)} simulated drives the ego's is "
+        f"{np.mean(found):.2f} in the mean and {median:.2f} in the median, and 95 % of drives lie between {low:.2f} "
+        f"and {high:.2f}."
+    )
+
+
 def page(text: str) -> str:
     """docs/edges.md of what `--output` wrote."""
     kept = json.loads(text)
@@ -63,7 +73,7 @@ def page(text: str) -> str:
         "",
     ]
     lines += ["## Statistics of real and of simulated edges", "", kept["statistics"]]
-    lines += ["## ATE and NEES by variant", "", ABOUT_TABLE, "", kept["table"]]
+    lines += ["## ATE and NEES by variant", "", ABOUT_TABLE, "", kept["table"], kept["nees"], ""]
     for what, found in kept["left"].items():
         lines += [f"## The best variant on all other logs: {what}", "", *(f"- {line}" for line in found), ""]
     return "\n".join(lines)

@@ -87,7 +87,7 @@ def rendered(folder: Path, logs: Path, configuration: Configuration) -> Case:
             for edge, shared in zip(m.cv, row, strict=True)
             if shared > LEAST_OVERLAP
         }
-    return Case(folder.name, log, ego, truth)
+    return Case(folder.name, log, ego, recording.camera, truth)
 
 
 def run(arguments: list[str]) -> None:
