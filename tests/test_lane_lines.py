@@ -558,6 +558,18 @@ def test_beyond_a_line_where_others_drove_who_is_new_drives_too() -> None:
     assert stood.oncoming < 0.5 * unknown.oncoming
 
 
+def test_where_the_ego_drives_fast_nobody_parks() -> None:
+    lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0)
+
+    def oncoming(ego_mps: float, standing: float) -> float:
+        new = UserInEgo(9, SE2(40.0, 16.0, math.pi), np.diag([1.0, 0.04, 0.01]), 4.0, 0.0, 8.0, standing=standing)
+        (place,) = with_users(lanes, [new], ego_mps, Traffic()).vehicles
+        return place.oncoming
+
+    assert oncoming(30.0, 0.7) > 0.7 > 0.4 > oncoming(10.0, 0.7)
+    assert oncoming(30.0, 0.99) < 0.3  # on the hard shoulder
+
+
 def test_the_side_of_the_road_is_stated_and_corrected_by_who_comes() -> None:
     lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8), line(3, -5.3)), 0)
     cov = np.diag([1.0, 0.04, 0.01])

@@ -27,7 +27,7 @@ def with_users(lanes: Lanes, users: Sequence[UserInEgo], ego_mps: float, traffic
     traffic.observe(near, between)
     shares = _shares(lanes.lanes, near)
     placed = [
-        (user, _placed(user, lanes.ego_index, share, traffic.way(user, seen)))
+        (user, _placed(user, lanes.ego_index, share, traffic.way(user, seen, ego_mps)))
         for user, share, seen in zip(near, shares, between, strict=True)
     ]
     ahead = [
