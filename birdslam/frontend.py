@@ -225,6 +225,7 @@ class FrontEnd:
             image_ground=None if motion is None else motion.ground,
             image_cov=None if motion is None else motion.tilt_cov,
             travelled_m=None if motion is None else math.hypot(step.x_m, step.y_m),
+            vertical=self._lanes.vertical,
         )
 
     def _map_road(self, frame: Frame) -> tuple[LandmarkEdge, ...]:

@@ -9,8 +9,9 @@ import pytest
 
 from birdslam.frontend import FrontEnd, FrontEndConfig
 from birdslam.geometry import bev
-from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.geometry.camera import Camera, GroundPlane, VerticalCurvature
 from birdslam.geometry.se2 import SE2
+from birdslam.mapping.lane_mapper import LaneMapper
 from birdslam.odometry.dead_reckoning import DeadReckoning
 from birdslam.odometry.odometry import Motion
 from birdslam.perception import Detections, Perception, Ready, Segmentation
@@ -230,3 +231,11 @@ def test_the_first_frame_says_that_nothing_is_known() -> None:
     assert Status.NOT_INITIALISED in first.status
     assert first.ground is not None
     assert GroundPlane(first.ground.height_m, first.ground.pitch_rad, first.ground.roll_rad) == CAMERA.ground
+
+
+def test_vehicles_and_lanes_have_one_vertical_curvature(monkeypatch: pytest.MonkeyPatch) -> None:
+    crest = VerticalCurvature(-0.002, 1e-4)
+    monkeypatch.setattr(LaneMapper, "vertical", property(lambda _: crest))
+    frontend = FrontEnd(CAMERA, FrontEndConfig(), ScriptedOdometry({}))
+    frontend.measure(Frame(0, 0, 0, 0, IMAGE), Ready(Perception(None, None, {}, ())))
+    assert frontend.vehicles.road.vertical_per_m == pytest.approx(crest.per_m, rel=0.1)

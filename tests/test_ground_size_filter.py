@@ -8,7 +8,7 @@ import pytest
 from msgspec.structs import replace
 
 from birdslam.geometry import bev
-from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.geometry.camera import PLANE_AT_M, Camera, GroundPlane, VerticalCurvature
 from birdslam.vehicles.placement.localisation import (
     DIMENSIONS,
     LocalisationConfig,
@@ -18,7 +18,7 @@ from birdslam.vehicles.placement.localisation import (
 )
 from birdslam.vehicles.state.ground_measurements import COMMON
 from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
-from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
+from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter, bend_of
 from birdslam.vehicles.state.parallax import LearnedSize
 
 CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
@@ -44,9 +44,11 @@ class Road:
         px = bev.ego_to_pixel(CAMERA, self.truth, np.array(corners))
         return np.array([*px.min(axis=0), *px.max(axis=0)])
 
-    def see(self, boxes: dict[int, np.ndarray], dt_s: float = 0.1) -> tuple[dict[int, float], dict[int, float]]:
+    def see(
+        self, boxes: dict[int, np.ndarray], dt_s: float = 0.1, vertical: VerticalCurvature | None = None
+    ) -> tuple[dict[int, float], dict[int, float]]:
         """Nearest depths in metres and the sigmas of their logarithms."""
-        self.ground_size.predict(dt_s, 0.0, None, None)
+        self.ground_size.predict(dt_s, 0.0, None, None, vertical=vertical)
         seen: list[Observation] = []
         for car, box in boxes.items():
             seen += observe_boxes(box[None], np.ones(1), ("car",), CAMERA, self.ground_size.ground, LOCALISATION)
@@ -277,3 +279,48 @@ def test_a_box_that_widens_is_of_a_car_that_turns_or_of_one_that_comes_nearer(sp
         depths = road.ground_size.estimate_depths([0], seen, extents[:, 1], extents[:, 0], np.zeros(1), motion)
     nearer_rel = 1.0 - float(np.exp(depths.log_depth[0])) / (30.0 - CAR.length_m / 2.0)
     assert nearer_rel < 0.04 if speed_mps else nearer_rel > 0.08
+
+
+def crest_errors(vertical_per_m: float, given: VerticalCurvature | None) -> list[float]:
+    """Relative depth errors of cars at 20, 32 and 44 m on a road of that vertical curvature, in their tenth frame."""
+    road = Road()
+    out: list[float] = []
+    for k in range(10):
+        boxes, faces = {}, {}
+        for i, x_m in enumerate((20.0 - 0.5 * k, 32.0 - 0.5 * k, 44.0 - 0.5 * k)):
+            faces[i] = x_m - CAR.length_m / 2.0
+            rise_m = 0.5 * vertical_per_m * faces[i] * (faces[i] - PLANE_AT_M)
+            boxes[i] = road.box(x_m, (-3.0, 0.0, 3.0)[i], CAR.height_m, rise_m)
+        depths, _ = road.see(boxes, vertical=given)
+        out = [depths[i] / faces[i] - 1.0 for i in boxes]
+    return out
+
+
+def test_vehicles_before_a_crest_stand_on_the_road_that_falls_away() -> None:
+    crest = VerticalCurvature(-0.002, 2e-4)
+    assert min(crest_errors(crest.per_m, None)) < -0.15, "a plane puts them much too near"
+    assert max(abs(error) for error in crest_errors(crest.per_m, crest)) < 0.05
+
+
+def test_boxes_do_not_correct_the_vertical_curvature_and_suffer_from_its_error() -> None:
+    sigma: dict[float, float] = {}
+    for own in (1e-5, 1e-3):
+        road, crest = Road(), VerticalCurvature(-0.002, own)
+        for _ in range(10):
+            _, sigmas = road.see({0: road.box(20.0, 0.0, 1.9), 1: road.box(40.0, 3.0, 1.2)}, vertical=crest)
+        mean, variance = bend_of(crest, CONFIG.sigma_vertical_per_m, CONFIG.vertical_dof)
+        assert road.ground_size.vertical_per_m == pytest.approx(mean)
+        assert road.ground_size.sigma_vertical_per_m == pytest.approx(math.sqrt(variance))
+        sigma[own] = sigmas[1]
+    assert sigma[1e-3] > 1.01 * sigma[1e-5]
+
+
+def test_a_hill_is_believed_and_a_small_bend_is_not() -> None:
+    hill, hill_var = bend_of(VerticalCurvature(0.002, 2e-4), 1.5e-4, 6.0)
+    small, small_var = bend_of(VerticalCurvature(1.5e-4, 2e-4), 1.5e-4, 6.0)
+    assert hill > 0.0018
+    assert small < 1e-4
+    assert small_var < hill_var < 2e-4**2
+    none, none_var = bend_of(VerticalCurvature(0.0, 5e-4), 1.5e-4, 6.0)
+    assert none == 0.0
+    assert math.sqrt(none_var) < 1.5e-4

@@ -186,6 +186,10 @@ def test_lines_over_a_crest_and_through_a_sag(vertical_per_m: float) -> None:
     assert np.median(np.abs(off)) < 0.15
     assert np.mean(np.abs(off) < 2.0 * np.array(sigmas)) > 0.9
     assert bends[-1] == pytest.approx(vertical_per_m, abs=4e-4)
+    by_images = tracker.lines().vertical
+    assert by_images is not None
+    assert by_images.per_m == pytest.approx(bends[-1], abs=2e-4), "without the prior it is a little more"
+    assert 0.0 < by_images.sigma_per_m < 4e-4
 
 
 @pytest.mark.parametrize("told", [1.0, 0.75])  # of the focal length
@@ -261,23 +265,6 @@ def test_lines_that_the_paint_does_not_lie_on_are_looked_for_anew(aside_m: float
         off.append([min((abs(line.y_m(8.0) - y) for line in lines), default=9.0) for y in (1.75, -1.75)])
     assert max(map(max, off[4:10])) < 0.15
     assert max(map(max, off[13:])) < 0.15
-
-
-def test_a_line_off_its_paint_gives_way_to_the_one_on_it() -> None:
-    tracker = LineTracker(CAMERA)
-
-    def left_lines(k: int, left_m: float) -> list[LaneLine]:
-        pose = SE2(2.0 * k, 0.0, 0.0)
-        image, masks = picture(pose, (left_m, -1.75, -5.2), (False, False, False))
-        tracker.update(pose, CAMERA.ground, (0.003, 0.0), image, masks, NOBODY)
-        return [x for x in tracker.lines().at(pose) if 0.0 < x.offset_m < 4.0 and x.kind is not LineKind.EDGE]
-
-    for k in range(10):
-        (old,) = left_lines(k, 1.75)
-    after = [left_lines(10 + k, 2.7) for k in range(5)]  # as after a jump of the ego's motion
-    assert [x.line for x in after[-1]] != [old.line]
-    assert len(after[-1]) == 1
-    assert after[-1][0].offset_m == pytest.approx(2.7, abs=0.15)
 
 
 def test_what_a_bonnet_mirrors_is_no_line_and_the_lane_is_not_drawn_over_it() -> None:

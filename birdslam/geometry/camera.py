@@ -16,7 +16,18 @@ from birdslam.geometry.arrays import Floats
 # Camera axes (x right, y down, z forward) to REP-103 axes (x forward, y left, z up).
 AXES_EGO_CAM = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
+# Where the ground under the camera is measured: the middle of the road that odometry looks at. The height of a road of
+# vertical curvature v over that plane is v x (x - PLANE_AT_M) / 2, x ahead: so pitch and curvature hardly mix
+PLANE_AT_M = 11.0
+
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+
+
+class VerticalCurvature(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Of the road ahead, with its 1-sigma, 1/m; > 0: it rises over the plane under the camera (`PLANE_AT_M`)."""
+
+    per_m: float
+    sigma_per_m: Positive
 
 
 class GroundPlane(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

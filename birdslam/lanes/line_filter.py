@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from birdslam.geometry.arrays import Bools, Floats, Ints
+from birdslam.geometry.camera import PLANE_AT_M, VerticalCurvature
 from birdslam.geometry.se2 import SE2
 from birdslam.lanes.curves import across_sigma_m, basis, moved, slope_basis
 from birdslam.lanes.paint import LinePoints
@@ -46,8 +47,8 @@ VERTICAL, DIRECTION, COMMON = 0, 1, 2
 SIGMA_COMMON = np.array([7e-4, 0.01])
 MEMORY_M = np.array([50.0, 40.0])
 LEAST_FALL = 0.3  # of a level road's: beyond it lies what a crest hides
-PLANE_AT_M = 11.0  # where the ground under the camera is measured: the middle of the road that odometry looks at
 FARTHEST_M, STEEPEST = 40.0, 2.0  # of a line's offset and slope: what is beyond has got lost
+MOST_OF_PRIOR = 0.9  # of the vertical curvature's variance: what has more left was not measured
 _CELLS = 1 << 16  # bins of one line, for keys
 _JITTER = 1e-9  # of a correlation
 
@@ -92,6 +93,15 @@ class LineFilter:
 
     def __len__(self) -> int:
         return len(self.curves)
+
+    @property
+    def vertical(self) -> VerticalCurvature | None:
+        """The road's vertical curvature by the images alone, without its prior; None where they say next to nothing."""
+        variance, before = self.cov[VERTICAL, VERTICAL], SIGMA_COMMON[VERTICAL] ** 2
+        if not len(self) or variance > MOST_OF_PRIOR * before:
+            return None
+        by_images = 1.0 / (1.0 / variance - 1.0 / before)
+        return VerticalCurvature(float(self.common[VERTICAL] * by_images / variance), float(np.sqrt(by_images)))
 
     def block(self, k: int) -> Floats:
         """(4, 4) covariance of one curve."""

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 
 from birdslam.geometry.arrays import Floats
+from birdslam.geometry.camera import VerticalCurvature
 from birdslam.geometry.se2 import SE2
 from birdslam.lanes.curves import across_sigma_m, basis, moved
 from birdslam.lanes.line_filter import FARTHEST_M, STEEPEST, Tilt
@@ -58,6 +59,7 @@ class TrackedLines:
     height_m: float  # of its camera
     sigma_roll_rad: float  # of its ground
     road_from_m: float  # where the road straight ahead begins to be in its view
+    vertical: VerticalCurvature | None = None  # of the road, by all images until then
 
     def at(self, T_world_ego: SE2) -> tuple[LaneLine, ...]:
         """The lines in the ego's frame at `T_world_ego`, moved by the ego's motion, from left to right."""

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from birdslam.geometry import bev
 from birdslam.geometry.arrays import Floats, Ints
-from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.geometry.camera import Camera, GroundPlane, VerticalCurvature
 from birdslam.geometry.se2 import SE2
 from birdslam.lanes.ego_lane import EgoLane
 from birdslam.lanes.line_tracker import LineTracker
@@ -154,6 +154,11 @@ class LaneMapper:
     def _forget(self) -> None:
         self._amodal.clear()
         self._tracker.clear()
+
+    @property
+    def vertical(self) -> VerticalCurvature | None:
+        """Of the road ahead, as lines were last seen."""
+        return None if self._lines is None else self._lines[1].vertical
 
     def view(self, T_world_ego: SE2) -> LaneView:
         """The grids and lanes around the ego, for a picture; not while a run is under way."""

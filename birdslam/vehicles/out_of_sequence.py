@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.geometry.camera import GroundPlane
+from birdslam.geometry.camera import GroundPlane, VerticalCurvature
 from birdslam.perception import DepthMap, Detections
 from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
 from birdslam.vehicles.track import EgoFrame, Track
@@ -40,6 +40,7 @@ class OpenFrame:
     image_ground: GroundPlane | None
     image_cov: NDArray[np.float64] | None
     travelled_m: float | None = None
+    vertical: VerticalCurvature | None = None
 
 
 class Beside(Protocol):
@@ -123,4 +124,5 @@ class OutOfSequenceTracker:
 
 
 def _predict(ground_size: GroundSizeFilter, frame: OpenFrame) -> None:
-    ground_size.predict(frame.dt_s, frame.turn_rad, frame.image_ground, frame.image_cov, frame.travelled_m)
+    of_road = frame.image_ground, frame.image_cov, frame.travelled_m, frame.vertical
+    ground_size.predict(frame.dt_s, frame.turn_rad, *of_road)

@@ -193,8 +193,9 @@ class Placing:
         seen, height_m = [a.observation for a in assignments], self.ground_size.ground.height_m
         above_roof_m = np.array([max(0.0, height_m - o.dimensions.height_m) for o in seen])
         roof_m2 = above_roof_m * expected.extent_m[:, 0] * self.ground_size.config.roof_reach_rel
+        yaw_rad, vertical = np.array(expected.yaw_rad), self.ground_size.vertical_per_m
         boxes = measure_boxes(
-            seen, expected.centre_m, expected.extent_m, expected.turned_rad, np.array(expected.yaw_rad), roof_m2
+            seen, expected.centre_m, expected.extent_m, expected.turned_rad, yaw_rad, roof_m2, vertical
         )
         return self.parallax.learn_sizes([a.row for a in assignments], boxes, T_world_ego, height_m)
 

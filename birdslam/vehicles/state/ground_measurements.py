@@ -1,9 +1,9 @@
 """The measurements of the boxes in `ground_size_filter.GroundSizeFilter`, and what a state expects of them.
 
-z is the depth of the nearest face, r on to the roof's far edge, y/x the box's bearing, H the camera's height:
+z is the depth of the nearest face, r on to the roof's far edge, y/x the box's bearing, H the camera's height; the road
+rises by pitch + tilt + v (z - PLANE_AT_M) / 2 - roll y/x - crown |y|/x, v its vertical curvature:
 
-    bottom = (H + edge) / z - pitch - tilt + roll y/x + crown |y|/x      (Eq. 1)
-    top = (H - h) / (z + r) - pitch - tilt + roll y/x + crown |y|/x
+    bottom = (H + edge) / z - rise      (Eq. 1)            top = (H - h) / (z + r) - rise
     log width = log w + log(class's outline) - log z
 """
 
@@ -15,13 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry import bev
+from birdslam.geometry.camera import PLANE_AT_M
 
 Floats = NDArray[np.float64]
 
 # States of all vehicles: tilt of the camera over the road, its crown, lasting errors of the images' tilt, what the
-# sizes and what the lower edges have in common
-PITCH, ROLL, CROWN, IMAGE_PITCH, IMAGE_ROLL, SIZE, LOWER = range(7)
-COMMON, OWN = 7, 4  # and of each vehicle:
+# sizes and what the lower edges have in common, the road's vertical curvature
+PITCH, ROLL, CROWN, IMAGE_PITCH, IMAGE_ROLL, SIZE, LOWER, VERTICAL = range(8)
+COMMON, OWN = 8, 4  # and of each vehicle:
 HEIGHT, OUTLINE, EDGE, TILT = range(OWN)
 Cue = Literal["bottom", "top", "width"]
 CUES: tuple[Cue, ...] = ("bottom", "top", "width")  # measurements of each box, in this order
@@ -41,7 +42,8 @@ def expected_boxes(
     depth, height = np.exp(x[m:]), np.exp(x[at])
     below = height_m + x[at + EDGE]
     far = np.where(height_m > height, depth + reach, depth)
-    level = x[PITCH] - tilt_rad[0] + x[at + TILT]
+    half = 0.5 * (depth - PLANE_AT_M)  # of the road's vertical curvature
+    level = x[PITCH] - tilt_rad[0] + x[at + TILT] + x[VERTICAL] * half
     lean = (x[ROLL] - tilt_rad[1]) * bearing + x[CROWN] * np.abs(bearing)
     bottom = bev.road_slope(depth, below) - level + lean  # Eq. 1
     top = (height_m - height) / far - level + lean
@@ -50,10 +52,12 @@ def expected_boxes(
     J[:n, ROLL] = J[n : 2 * n, ROLL] = bearing
     J[:n, CROWN] = J[n : 2 * n, CROWN] = np.abs(bearing)
     J[rows, at + TILT] = J[n + rows, at + TILT] = -1.0
+    J[:n, VERTICAL] = J[n : 2 * n, VERTICAL] = -half
     J[rows, at + EDGE] = 1.0 / depth
-    J[rows, m + rows] = -below / depth
+    falls = 0.5 * x[VERTICAL] * depth
+    J[rows, m + rows] = -below / depth - falls
     J[n + rows, at] = -height / far
-    J[n + rows, m + rows] = -(height_m - height) / far**2 * depth
+    J[n + rows, m + rows] = -(height_m - height) / far**2 * depth - falls
     J[2 * n + rows, at + OUTLINE] = 1.0
     J[2 * n + rows, m + rows] = -1.0
     return np.concatenate([bottom, top, x[at + OUTLINE] - x[m:]]), J

@@ -1,6 +1,6 @@
 """The road's tilt and the vehicles' sizes, each from the other, by the boxes of the vehicles alone.
 
-    x = [pitch, roll, crown, errors of the images' tilt, common size and edge,
+    x = [pitch, roll, crown, errors of the images' tilt, common size and edge, vertical curvature,
          and of every vehicle: log h, log w, edge, tilt]      and, for one frame only, of every box: log z
 
 One Kalman filter holds them all. What is wrong as long as a drive or a track lasts is a state of the drive or of the
@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.geometry.camera import Camera, GroundPlane, VerticalCurvature
 from birdslam.vehicles.placement.localisation import Observation
 from birdslam.vehicles.state.ground_measurements import (
     COMMON,
@@ -34,6 +34,7 @@ from birdslam.vehicles.state.ground_measurements import (
     ROLL,
     SIZE,
     TILT,
+    VERTICAL,
     expected_boxes,
     robust_information,
 )
@@ -44,6 +45,8 @@ from birdslam.vehicles.state.size_prior import MIN_VARIANCE, SizePrior
 Floats = NDArray[np.float64]
 
 ITERATIONS = 2
+BEND_ITERATIONS = 5
+LEVEL_VARIANCE = 1e-16  # of the vertical curvature where lanes say nothing: the road is taken for a plane
 DEPTH_UNKNOWN = 2.0  # 1-sigma of log z before a frame is seen
 UNUSED = 1e3  # 1-sigma of a cue that is not used
 _TILTS, _ROAD, _IMAGES = slice(PITCH, ROLL + 1), slice(PITCH, CROWN + 1), slice(IMAGE_PITCH, IMAGE_ROLL + 1)
@@ -81,7 +84,7 @@ class GroundSizeFilter:
         self._sigma_tilt = np.zeros(0)
         self._x = np.array([camera.pitch_rad, camera.roll_rad, *np.zeros(COMMON - 2)])
         common = np.square([config.sigma_common_rel, config.sigma_common_edge_rel])
-        self._P = np.diag([*config.road_var, *config.image_var, *common])
+        self._P = np.diag([*config.road_var, *config.image_var, *common, LEVEL_VARIANCE])
         self._sizes = SizePrior(config.sigma_common_rel, config.size_dof)
         self._image_ground = camera.ground
 
@@ -102,6 +105,16 @@ class GroundSizeFilter:
     def sigma_pitch_rad(self) -> float:
         """1-sigma of its pitch."""
         return math.sqrt(float(self._P[PITCH, PITCH]))
+
+    @property
+    def vertical_per_m(self) -> float:
+        """The road's vertical curvature; > 0: it rises ahead, over `ground` (`PLANE_AT_M`)."""
+        return float(self._x[VERTICAL])
+
+    @property
+    def sigma_vertical_per_m(self) -> float:
+        """1-sigma of it."""
+        return math.sqrt(float(self._P[VERTICAL, VERTICAL]))
 
     @property
     def tilt_cov(self) -> Floats:
@@ -150,11 +163,13 @@ class GroundSizeFilter:
         image_ground: GroundPlane | None,
         image_cov: Floats | None,
         travelled_m: float | None = None,
+        vertical: VerticalCurvature | None = None,
     ) -> None:
         """To the next frame: `turn_rad` the camera's own pitching (nose down > 0), None where it is not known.
 
         `image_ground` is the road by the images, None where they don't measure it, `image_cov` (2, 2) that of its pitch
-        and roll. `travelled_m` is the ego's way, None where it is not known: it is taken to drive.
+        and roll. `travelled_m` is the ego's way, None where it is not known: it is taken to drive. `vertical` is the
+        road's vertical curvature by the lanes, None where they don't measure it.
         """
         config = self.config
         share = 1.0 if travelled_m is None else self._driving_share(travelled_m / max(dt_s, _MIN_DT_S))
@@ -176,6 +191,7 @@ class GroundSizeFilter:
         step = config.sigma_pitch_blind_rad if turn_rad is None else config.sigma_pitch_step_rad
         noise[PITCH] += share * step**2
         self._P[np.diag_indices_from(self._P)] += noise
+        self._bend(vertical)
         if image_ground is not None and image_cov is not None and image_ground != self._image_ground:
             self._image_ground = image_ground
             self._correct_tilt(image_ground, image_cov / max(share, _MIN_SHARE))
@@ -291,11 +307,15 @@ class GroundSizeFilter:
             innovation = z - expected - J @ (prior - x)
             gate_sigma = self.config.gate_sigma if iteration == ITERATIONS - 1 else math.inf
             gain = PJt @ robust_information(S + np.diag(R), innovation, gate_sigma)
+            gain[VERTICAL] = 0.0
             x = prior + gain @ innovation
         P = P - gain @ PJt.T
+        P[VERTICAL] = P[:, VERTICAL]
         lasting = S + np.diag(R * np.tile(correlated, len(CUES)))
         kept = PJt[:m] @ robust_information(lasting, innovation, self.config.gate_sigma)
+        kept[VERTICAL] = 0.0
         kept_P = self._P - kept @ PJt[:m].T
+        kept_P[VERTICAL] = kept_P[:, VERTICAL]
         self._x, self._P = prior[:m] + kept @ innovation, (kept_P + kept_P.T) / 2.0
         return x[m:], np.diag(P)[m:].copy(), x[at], np.maximum(P[at, at], MIN_VARIANCE), P[range(m, m + n), at]
 
@@ -304,10 +324,42 @@ class GroundSizeFilter:
         sigma_rel = np.array([self.config.image_pitch_sigma_rel, 1.0])
         PHt = self._P[:, _TILTS] + self._P[:, _IMAGES]
         gain = PHt @ np.linalg.inv(PHt[_TILTS] + PHt[_IMAGES] + cov * np.outer(sigma_rel, sigma_rel))
+        gain[VERTICAL] = 0.0
         expected = self._x[_TILTS] + self._x[_IMAGES]
         self._x = self._x + gain @ (np.array([by_images.pitch_rad, by_images.roll_rad]) - expected)
         P = self._P - gain @ PHt.T
+        P[VERTICAL] = P[:, VERTICAL]
         self._P = (P + P.T) / 2.0
+
+    def _bend(self, by_lanes: VerticalCurvature | None) -> None:
+        """The road's vertical curvature: boxes suffer from its error, and don't correct it (Schmidt).
+
+        Boxes that end a little too low, or cars that are all a little taller than their class, look like a sag: taught
+        by boxes, it made real roads worse.
+        """
+        config = self.config
+        mean, variance = 0.0, LEVEL_VARIANCE
+        if by_lanes is not None:
+            mean, variance = bend_of(by_lanes, config.sigma_vertical_per_m, config.vertical_dof)
+        ratio = math.sqrt(variance / self._P[VERTICAL, VERTICAL])
+        self._P[VERTICAL] *= ratio
+        self._P[:, VERTICAL] *= ratio
+        self._P[VERTICAL, VERTICAL] = variance  # free of the rounding
+        self._x[VERTICAL] = mean
+
+
+def bend_of(by_lanes: VerticalCurvature, scale_per_m: float, dof: float) -> tuple[float, float]:
+    """(mean, variance) of a road's vertical curvature by the lanes' and by what roads do, Student's t.
+
+    Most roads are flat, and hills are ten of their sigmas: the t lets the lanes tell a hill, and holds a small bend to
+    be none. Its weight is found by fixed-point iterations (expectation maximisation).
+    """
+    mean, variance = by_lanes.per_m, by_lanes.sigma_per_m**2
+    for _ in range(BEND_ITERATIONS):
+        of_roads = (dof * scale_per_m**2 + mean**2) / (dof + 1.0)
+        variance = 1.0 / (1.0 / of_roads + by_lanes.sigma_per_m**-2)
+        mean = variance * by_lanes.per_m / by_lanes.sigma_per_m**2
+    return mean, variance
 
 
 def _mixed(weight: Floats, means: Floats, variances: Floats) -> tuple[Floats, Floats]:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry import bev
+from birdslam.geometry.camera import PLANE_AT_M
 from birdslam.geometry.se2 import SE2
 from birdslam.vehicles.placement.localisation import NEAREST_M, Observation
 
@@ -51,10 +52,12 @@ def measure_boxes(
     turned_rad: Floats,
     yaw_rad: Floats,
     roof_m2: Floats,
+    vertical_per_m: float = 0.0,
 ) -> ParallaxMeasurements:
     """Of observations (N,), with each centre (N, 2) in ego at about its depth, and extents (N, 2) as of `extent_m`.
 
     `roof_m2` (N,): how far the camera stands above the roof times how far the roof reaches along the line of sight.
+    `vertical_per_m`: the road's vertical curvature; bottoms count from the plane's horizon.
     """
     depth = np.maximum(centres_m[:, 0] - extents_m[:, 0] / 2.0, NEAREST_M)
     over_roof = roof_m2 / (depth * (depth + extents_m[:, 0]))
@@ -72,7 +75,7 @@ def measure_boxes(
         bearing=centres_m[:, 1] / centres_m[:, 0],
         sigma=np.array(sigma).reshape(-1, 3),
         depth_m=depth,
-        bottom=np.array([o.slope_bottom for o in seen]),
+        bottom=np.array([o.slope_bottom for o in seen]) + 0.5 * vertical_per_m * (depth - PLANE_AT_M),
         sigma_bottom=np.array([o.sigma_bottom for o in seen]),
         reach_m=extents_m[:, 0] / 2.0,
         turned_rad=turned_rad,
