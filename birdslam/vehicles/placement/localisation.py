@@ -216,7 +216,7 @@ def place(seen: Observation, log_depth: float, var_depth: float, yaw_rad: float,
     """The observation's place in ego at a depth with its variance, both of the logarithm; yaw against the ego."""
     depth_m = math.exp(log_depth)
     x_m, y_m, reach_m, outline = centre_at(seen, depth_m, yaw_rad, config)
-    if seen.cut_side:
+    if seen.cut_side and reach_m > 0.0:  # the paper stays at the face
         # What is seen of it is narrower than its outline: the rest is beside the ego, nearer than what is seen
         narrower = max(0.0, config.cut_width_rel - seen.tan_width / outline)
         hidden_m = min(config.cut_length_rel * narrower, 1.0) * 2.0 * reach_m
