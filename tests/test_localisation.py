@@ -62,6 +62,17 @@ def test_the_centre_follows_from_the_nearest_face_and_the_yaw(x_m: float, slope:
     assert found.centre_m == pytest.approx([x_m, slope * x_m], abs=0.06)
 
 
+@pytest.mark.parametrize(("x_m", "y_m"), [(3.0, 3.0), (3.5, 3.5), (4.0, -4.0), (4.5, 4.5)])
+def test_of_a_car_beside_the_ego_the_part_that_no_image_shows_counts(x_m: float, y_m: float) -> None:
+    border = (CAMERA.cx_px if y_m > 0.0 else CAMERA.width_px - CAMERA.cx_px) / CAMERA.fx_px
+    cut = np.clip(box_of_car(x_m, y_m), 0.0, [CAMERA.width_px, CAMERA.height_px] * 2)
+    seen_from_m = (abs(y_m) - CAR.width_m / 2.0) / border  # the ray of the border meets its side
+    beyond_m = seen_from_m + CAR.length_m / 2.0 - x_m  # as if that were its nearest face
+    found = locate(cut, seen_from_m)
+    assert abs(found.centre_m[0] - x_m) < 0.3 * beyond_m
+    assert abs(found.centre_m[0] - x_m) < 2.0 * math.sqrt(found.cov[0, 0])
+
+
 def test_a_box_cut_at_the_side_is_placed_by_its_other_edge() -> None:
     whole = box_of_car(10.0, 7.0)
     assert whole[0] < 0.0 < whole[2]

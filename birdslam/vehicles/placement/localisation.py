@@ -56,6 +56,10 @@ class LocalisationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     sure_score: float = 0.9  # see sigma_growth
     reach_rel: float = 1.0  # of the way from the nearest face to the centre; the paper stays at the face (0)
     sigma_cut_rel: float = 1.0  # an edge cut by the image is anywhere within the box
+    # Of a vehicle at the image's side: a box narrower than this, of its outline's width, lacks a part of its length
+    cut_width_rel: float = 0.7
+    cut_length_rel: float = 1.0  # of its length: what it lacks, by how much narrower its box is
+    sigma_reach_cut_rel: float = 0.75  # 1-sigma of the way to its centre, of that way
     sigma_hidden_rel: float = 0.025  # an edge behind a nearer vehicle is the detector's guess
     cut_margin_px: float = 4.0  # an edge so near to the image's border counts as cut
     # of the box's height, at the image's bottom: detectors draw a cut edge a little inside of it
@@ -212,6 +216,11 @@ def place(seen: Observation, log_depth: float, var_depth: float, yaw_rad: float,
     """The observation's place in ego at a depth with its variance, both of the logarithm; yaw against the ego."""
     depth_m = math.exp(log_depth)
     x_m, y_m, reach_m, outline = centre_at(seen, depth_m, yaw_rad, config)
+    if seen.cut_side and reach_m > 0.0:  # the paper stays at the face
+        # What is seen of it is narrower than its outline: the rest is beside the ego, nearer than what is seen
+        narrower = max(0.0, config.cut_width_rel - seen.tan_width / outline)
+        hidden_m = min(config.cut_length_rel * narrower, 1.0) * 2.0 * reach_m
+        x_m, y_m, reach_m, _ = centre_at(seen, max(depth_m - hidden_m, NEAREST_M), yaw_rad, config)
     of_left, of_right = seen.sigma_left**-2, seen.sigma_right**-2
 
     # An edge alone gives the centre as well as half of the outline is known; of a vehicle that leaves the image at its
@@ -221,7 +230,7 @@ def place(seen: Observation, log_depth: float, var_depth: float, yaw_rad: float,
     sigma_across = math.hypot(
         1.0 / math.sqrt(of_left + of_right), lopsided * sigma_half, config.shape_floor_m / max(x_m, 1.0)
     )
-    sigma_reach_m = reach_m * (1.0 if seen.cut_side else seen.dimensions.sigma_length_rel)
+    sigma_reach_m = reach_m * (config.sigma_reach_cut_rel if seen.cut_side else seen.dimensions.sigma_length_rel)
     along = x_m**2 * var_depth + sigma_reach_m**2
     return Place(depth_m, np.array([x_m, y_m]), line_of_sight_cov(x_m, y_m, along, (x_m * sigma_across) ** 2))
 
