@@ -3,8 +3,9 @@
     python -m perf films [FILM ...] [--part PART ...] [--seconds S] [--begin-at S ...] [--output DIR] [--data DIR]
                          [--networks] [--model ROLE=PATH ...]
     python -m perf films FILM --run DIR     # what `birdslam run --output DIR` left of it, by seconds
+    python -m perf films [FILM ...] --calibrate --output DIR     # their camera files anew (CAMERAS), nothing else
 
-The camera is found once, as `birdslam run` finds it; then the odometry alone drives each variant (film_variants.py).
+The odometry alone drives each variant (film_variants.py), all of a film by one camera file, the same each day.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from __future__ import annotations
 import argparse
 import math
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -92,14 +93,18 @@ FILMS = {
     "01": Film("kitti:{data}/kitti_odometry/sequences/01"),
 }
 DEFAULT = ("town", "town_72", "motorway", "00", "0005")
+# A file for each film that has no camera of its own, by `calibrate` of a day that it names: found anew, its tilt would
+# differ with each change of the code, and the tables would compare days in place of sizes and rates
+CAMERAS = Path(__file__).resolve().parents[1] / "film_cameras"
 
 
 def run(arguments: list[str]) -> None:
-    parser = benchmark_parser("films", label, output="folder of films.json, films.md, films.png and the cameras")
+    parser = benchmark_parser("films", label, output="folder of films.json, films.md and films.png")
     parser.add_argument("films", nargs="*", metavar="FILM", help=f"of {', '.join(FILMS)}")
     parser.add_argument("--part", action="append", choices=PARTS, help="this one alone; repeatable")
     parser.add_argument("--begin-at", type=float, nargs="+", metavar="S", help="of the film")
     parser.add_argument("--seconds", type=float, default=SECONDS, help="of each variant")
+    parser.add_argument("--calibrate", action="store_true", help="find the films' cameras anew, into --output")
     parser.add_argument("--run", type=Path, metavar="DIR", help="compare what `birdslam run` left there of the film")
     add_data(parser)
     add_networks(parser)
@@ -111,6 +116,11 @@ def run(arguments: list[str]) -> None:
     try:
         if options.run is not None:
             print(text_of_run(options.run, options.films, options.data))
+            return
+        if options.calibrate:
+            if options.output is None:
+                raise PerfError("--calibrate needs --output: where the camera files go")
+            calibrate_films(options.films or FILMS, options.data, options.output)
             return
         rows = measure_all(options)
     except (DatasetError, ModelError) as error:
@@ -128,7 +138,7 @@ def measure_all(options: argparse.Namespace) -> list[dict[str, Any]]:
     with Ledger(path, label, seconds=options.seconds, networks=configuration is not None) as ledger:
         for name in options.films or DEFAULT:
             film = FILMS[name]
-            camera = camera_of(name, film, options.data, output)
+            camera = camera_of(name)
             between_mps = film.between_mps or (0.0, math.inf)
             recording = open_recording(film.uri.format(data=options.data), camera)
             true_mps = truth(film, recording, options.data)
@@ -150,17 +160,22 @@ def measure_all(options: argparse.Namespace) -> list[dict[str, Any]]:
     return rows
 
 
-def camera_of(name: str, film: Film, data: Path, output: Path | None) -> Camera | None:
-    """The camera of a film, by `calibrate`; None of a recording that has its own."""
-    if film.height_m is None:
-        return None
-    kept = None if output is None else output / f"{name}.toml"
-    if kept is not None and kept.is_file():
-        return load_camera(kept)
-    found = calibrate_drive(load(None, {}), film.uri.format(data=data), film.given(data), config=ROUGH, must_show=False)
-    if kept is not None:
-        write_camera_file(kept, found.camera, found.report)
-    return found.camera
+def camera_of(name: str) -> Camera | None:
+    """The camera of a film, the same each day; None of a recording that has its own."""
+    return None if FILMS[name].height_m is None else load_camera(CAMERAS / f"{name}.toml")
+
+
+def calibrate_films(names: Iterable[str], data: Path, output: Path) -> None:
+    """A camera file for each of the films that has none of its own, as `birdslam run` finds it."""
+    for name in names:
+        film = FILMS[name]
+        if film.height_m is None:
+            continue
+        found = calibrate_drive(
+            load(None, {}), film.uri.format(data=data), film.given(data), config=ROUGH, must_show=False
+        )
+        write_camera_file(output / f"{name}.toml", found.camera, found.report)
+        print(f"{output / name}.toml")
 
 
 def text_of_run(folder: Path, films: list[str], data: Path) -> str:

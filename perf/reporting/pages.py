@@ -196,11 +196,12 @@ PAGES: tuple[Derived | Page, ...] = (
     Page(
         "films",
         (
-            f"python -m birdslam.perf films --part sizes --part starts --seconds {FILMS_S} --data {{data}} "
-            "--output {out}",
+            f"python -m birdslam.perf films --part sizes --part noise --part starts --seconds {FILMS_S} "
+            "--data {data} --output {out}",
         ),
         {"docs/films.md": ("films.md", None)},
         (films.run,),
+        ("perf/film_cameras",),
     ),
     Page(
         "overlays",

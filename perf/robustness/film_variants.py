@@ -76,8 +76,9 @@ class Variant:
             yield t_ns, image
 
 
-PARTS = ("starts", "sizes", "compression", "view")
+PARTS = ("starts", "sizes", "noise", "compression", "view")
 _SIZES, _EVERY = (1.0, 0.5, 0.75, 2.0), (1, 2, 3)
+_NOISE_GREY, _DRAWS = 1.5, 5  # 1-sigma: no eye sees it
 
 
 def variants(camera: Camera, part: str) -> list[Variant]:
@@ -85,6 +86,7 @@ def variants(camera: Camera, part: str) -> list[Variant]:
     every = {
         "starts": [_other(1.0, 1), _other(0.5, 1), _other(1.0, 2), _other(1.0, 3)],
         "sizes": [_other(size, n) for size in _SIZES for n in _EVERY],
+        "noise": [Variant("unchanged"), *(Variant(f"noise, draw {n}", shown=_noise(n)) for n in range(1, _DRAWS + 1))],
         "compression": [Variant("unchanged"), *(Variant(f"H.264, crf {crf}", crf=crf) for crf in (18, 23, 28, 35))],
         "view": [
             Variant("unchanged"),
@@ -128,6 +130,16 @@ def _encoded(film: Iterator[Timed], crf: int | None, folder: Path) -> Iterator[T
             image = np.asarray(frame.to_ndarray(format="bgr24"), np.uint8)
             more = ((0, rows - image.shape[0]), (0, columns - image.shape[1]), (0, 0))
             yield t_ns, np.pad(image, more, mode="edge")
+
+
+def _noise(draw: int) -> Change:
+    """Noise that no eye sees: by how much metres differ then, other differences say nothing."""
+
+    def noisy(index: int, image: Image) -> Image:
+        added = np.random.default_rng((draw, index)).normal(0.0, _NOISE_GREY, image.shape)
+        return np.clip(np.rint(image + added), 0, 255).astype(np.uint8)
+
+    return noisy
 
 
 # --- what is in the way ---

@@ -1,0 +1,43 @@
+"""`python -m perf films`: variants of a film are driven by one camera, and chance is among them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from birdslam.geometry.camera import Camera
+from birdslam.perf.accuracy.films import CAMERAS, FILMS, camera_of
+from birdslam.perf.robustness.film_variants import variants
+
+CAMERA = Camera(640, 360, 500.0, 500.0, 320.0, 180.0, 1.4)
+
+
+@pytest.mark.parametrize("name", FILMS)
+def test_a_films_camera_is_that_of_its_file_each_day(name: str) -> None:
+    camera = camera_of(name)
+    if FILMS[name].height_m is None:
+        assert camera is None  # the recording has its own
+    else:
+        assert camera is not None
+        assert camera == camera_of(name)
+        assert camera.height_m == FILMS[name].height_m
+
+
+def test_no_camera_file_is_left_of_a_film_that_is_gone() -> None:
+    assert {path.stem for path in CAMERAS.iterdir()} == {
+        name for name, film in FILMS.items() if film.height_m is not None
+    }
+
+
+def test_draws_of_noise_differ_repeat_and_are_hardly_seen() -> None:
+    unchanged, *draws = variants(CAMERA, "noise")
+    image = np.full((36, 64, 3), 120, np.uint8)
+    assert unchanged.shown is None
+    shown = [draw.shown(7, image) for draw in draws if draw.shown is not None]
+    assert len(shown) == len(draws) >= 5
+    for k, one in enumerate(shown):
+        assert 1.0 < one.std() < 2.0
+        assert abs(one.mean() - 120.0) < 0.2
+        assert all((one != other).any() for other in shown[:k])
+    assert draws[0].shown is not None
+    np.testing.assert_array_equal(shown[0], draws[0].shown(7, image))
