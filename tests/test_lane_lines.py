@@ -267,6 +267,23 @@ def test_lines_that_the_paint_does_not_lie_on_are_looked_for_anew(aside_m: float
     assert max(map(max, off[13:])) < 0.15
 
 
+def test_a_line_off_its_paint_gives_way_to_the_one_on_it() -> None:
+    tracker = LineTracker(CAMERA)
+
+    def left_lines(k: int, left_m: float) -> list[LaneLine]:
+        pose = SE2(2.0 * k, 0.0, 0.0)
+        image, masks = picture(pose, (left_m, -1.75, -5.2), (False, False, False))
+        tracker.update(pose, CAMERA.ground, (0.003, 0.0), image, masks, NOBODY)
+        return [x for x in tracker.lines().at(pose) if 0.0 < x.offset_m < 4.0 and x.kind is not LineKind.EDGE]
+
+    for k in range(10):
+        (old,) = left_lines(k, 1.75)
+    after = [left_lines(10 + k, 2.7) for k in range(5)]  # as after a jump of the ego's motion
+    assert [x.line for x in after[-1]] != [old.line]
+    assert len(after[-1]) == 1
+    assert after[-1][0].offset_m == pytest.approx(2.7, abs=0.15)
+
+
 def test_what_a_bonnet_mirrors_is_no_line_and_the_lane_is_not_drawn_over_it() -> None:
     edge_px = np.array([[0.0, 190.0], [320.0, 165.0], [639.0, 190.0]])
     image, masks = picture(SE2(), (1.75, -1.75), (False, False))

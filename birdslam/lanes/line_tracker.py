@@ -33,9 +33,13 @@ APART_M = 0.45  # from a known line
 EDGE_WEIGHT = 0.3  # of an edge's points in the search: side roads and kerbstones bend a mask's border
 MOST_LINES = 9
 CONFIRMED, MOST_SCORE = 3.0, 8.0
+SEEN_M = 2.0  # of paint: an image has the line
 SAME_M = 0.3  # two lines nearer than this along all of 5 to 20 m are one
 FORGOTTEN_M = -2.0  # a line that ended so far behind the ego is dropped
 NEAR_M, FAR_M = 5.0, 25.0  # where a line that is there has to be seen
+# Two lines nearer than this anywhere there bound no lane: one whose paint an image lacks gives way to one whose paint
+# it has, so many times as fast as where it is alone
+NARROW_M, GIVES_WAY = 1.5, 3.0
 PAST_EDGE_M, MOST_ROAD_PAST = 0.8, 0.35  # so far past an edge there is no road along so much of it
 LEAST_EXISTENCE, LOOKS_OF_A_SCRAP = 0.4, 4.0  # what has less after so many images is dropped
 AFRESH_M = 10.0  # travelled, as it were, before an image without a past
@@ -217,6 +221,7 @@ class LineTracker:
 
     def _judge(self, view: RoadView, points: LinePoints, seen: list[Support]) -> None:
         """Which lines were seen, over which range, how much of them is paint."""
+        contested = self._contested(points, seen)
         for k, (track, support) in enumerate(zip(self._tracks, seen, strict=True)):
             x = view.x_m
             # Where the line is in the view, which is of a plane
@@ -238,16 +243,16 @@ class LineTracker:
                 ):
                     track.score -= 1.0
                     continue
-            support_m = float(np.minimum(mine.weight, 1.0).sum())
+            support_m = _length_m(mine)
             track.evidence_m += support_m
-            if support_m >= 2.0:
+            if support_m >= SEEN_M:
                 track.score = min(track.score + (1.0 if mine.masked.mean() > 0.3 else 0.5), MOST_SCORE)
                 track.seen_from_m = (
                     min(track.seen_from_m, float(mine.x_m.min())) if track.looks else float(mine.x_m.min())
                 )
                 track.seen_to_m = max(track.seen_to_m, float(np.quantile(mine.x_m, 0.98)))
             elif visible_m > 8.0:
-                track.score -= 1.0
+                track.score -= GIVES_WAY if k in contested else 1.0
             near = (x > PROFILE_M[0]) & (x < PROFILE_M[1]) & clear
             length_m = float(view.row_m[near].sum())
             if length_m > 6.0 and track.kind == PAINT:
@@ -266,6 +271,20 @@ class LineTracker:
                     track.double += (double - track.double) / track.resolved
             elif track.kind != PAINT:
                 track.looks += 1.0
+
+    def _contested(self, points: LinePoints, seen: list[Support]) -> set[int]:
+        """Lines beside which the image has another, sure line's paint: lines of one road neither meet nor cross."""
+        ys = self._filter.curves @ basis(np.arange(NEAR_M, FAR_M, 2.0)).T
+        there = [
+            j
+            for j, (track, support) in enumerate(zip(self._tracks, seen, strict=True))
+            if track.kind == PAINT and track.line >= 0 and _length_m(points.of(support.points)) >= SEEN_M
+        ]
+        return {
+            k
+            for k, track in enumerate(self._tracks)
+            if track.kind == PAINT and any(j != k and np.abs(ys[j] - ys[k]).min() < NARROW_M for j in there)
+        }
 
     def _add_lines(self, points: LinePoints, of: Ints, seen: list[Support], height_m: float) -> None:
         """Lines of points that lie on none that is known."""
@@ -331,6 +350,10 @@ def _explained_m(paint: LinePoints, tracks: list[Track], seen: list[Support]) ->
     on = [support.points for track, support in zip(tracks, seen, strict=True) if track.kind == PAINT]
     mine = np.concatenate([np.zeros(0, np.int64), *on])
     return float(paint.weight[mine][paint.masked[mine] & (paint.x_m[mine] < SEARCHED_M)].sum())
+
+
+def _length_m(points: LinePoints) -> float:
+    return float(np.minimum(points.weight, 1.0).sum())
 
 
 def _joined(*parts: LinePoints) -> LinePoints:
