@@ -206,6 +206,20 @@ def test_messages_that_were_lost_on_the_way_are_counted(join: Any, base: Path) -
     assert estimates.dropped == 3
 
 
+def test_a_message_that_comes_twice_is_received_once(join: Any, base: Path) -> None:
+    """Who comes late asks for the last one, and gets it a second time where it was just being sent."""
+    estimates = join("supervisor", hub=True).subscriber("estimate", depth=16)
+    with foreign_session(base) as foreign:
+        block, urgent = zenoh.CongestionControl.BLOCK, zenoh.Priority.REAL_TIME
+        publisher = foreign.declare_publisher(key_of("car", "estimate"), congestion_control=block, priority=urgent)
+        until(lambda: matched(publisher), "somebody who subscribes")
+        for number in (1, 1, 2, 2, 1):  # the last one is of a sender that was started again
+            stages = (Stage("optimize", 1, 2, 3 + (number == 1)),)
+            publisher.put(encode(estimate(number)), attachment=encode(Trace(stages, number=number)))
+        assert [received(estimates).record.frame_id for _ in range(3)] == [1, 2, 1]
+    assert estimates.dropped == 0
+
+
 def test_only_the_topics_own_records_are_sent(join: Any) -> None:
     hub = join("supervisor", hub=True)
     with pytest.raises(TypeError, match="estimate takes Estimate, not FrameRef"):

@@ -68,13 +68,21 @@ def test_images_keep_their_size_and_times(variant: Variant, tmp_path: Path) -> N
 
 
 def test_what_is_in_the_way_is_seen(tmp_path: Path) -> None:
+    noise = {variant.name for variant in variants(CAMERA, "noise")}
     for variant in EVERY:
-        if variant.shown is not None:
+        if variant.shown is not None and variant.name not in noise:
             changed = [
                 np.abs(np.asarray(shown, float) - raw).max()
                 for (_, shown), (_, raw) in zip(variant.images(iter(film()), tmp_path), film(), strict=True)
             ]
             assert max(changed) > 10.0, variant.name
+
+
+def test_noise_is_in_each_image_and_no_eye_sees_it(tmp_path: Path) -> None:
+    for variant in variants(CAMERA, "noise"):
+        if variant.shown is not None:
+            for (_, shown), (_, raw) in zip(variant.images(iter(film()), tmp_path), film(), strict=True):
+                assert 1.0 < np.std(np.asarray(shown, float) - raw) < 2.0
 
 
 def test_a_truth_whose_every_third_step_is_too_long_makes_no_rate_another_one() -> None:

@@ -689,6 +689,15 @@ def test_the_lane_between_the_last_dashes_and_the_kerb_is_on_the_road() -> None:
     assert true_place(body(4, 30.0, 3.4, math.pi), truth[:3] + truth[4:]) == "oncoming"
 
 
+def test_cars_along_the_kerb_beyond_a_whole_lane_are_parked_off_the_road() -> None:
+    lines = ("kerb", -6.4), ("dashed", -1.3), ("double", 1.7), ("dashed", 4.7), ("kerb", 9.8)
+    truth = tuple(true_line(k, kind, y) for k, (kind, y) in enumerate(lines))
+    assert true_place(body(1, 30.0, -2.8), truth) == "right"
+    assert true_place(body(2, 30.0, -5.4), truth) == "off_road"
+    assert true_place(body(3, 30.0, 6.2, math.pi), truth) == "oncoming"
+    assert true_place(body(4, 30.0, 8.8), truth) == "off_road"
+
+
 def test_traffic_tells_which_way_a_lane_runs() -> None:
     lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0)
     cov = np.diag([1.0, 0.04, 0.01])

@@ -171,6 +171,8 @@ class Subscriber:
                 log.warning("%s: a malformed message is ignored, and all that follow: %s", self._key, error)
             return
         with self._arrived:
+            if _is_again(self.newest, message):
+                return
             self.dropped += _lost_between(self.newest, message)
             self.dropped += len(self._queue) == self._queue.maxlen
             self.newest = message
@@ -210,6 +212,11 @@ class Subscriber:
             self._closed = True
             self._arrived.notify_all()
         self._subscriber.undeclare()
+
+
+def _is_again(earlier: Message | None, later: Message) -> bool:
+    """Whether it is the same message: asked for as the topic's last one, and sent meanwhile."""
+    return earlier is not None and later.trace.number > 0 and later.trace == earlier.trace
 
 
 def _lost_between(earlier: Message | None, later: Message) -> int:

@@ -22,6 +22,8 @@ PEOPLE = ("pedestrian", "cyclist")  # bodies that are no vehicle's
 LEAST_PROBABILITY = 1e-3  # a certain error counts as so much in the log loss
 AGAINST_RAD = math.pi / 2
 DASHED = "dashed"  # of a true line's kinds
+# Wide enough a strip beside a lane for cars to park in it; lanes of one road differ by a few decimetres
+PARKED_M = 1.7
 PLACES = ("ego_lane", "left", "right", "oncoming", "off_road")
 
 
@@ -122,11 +124,24 @@ def true_place(body: TrueBody, truth: tuple[TrueLine, ...]) -> str | None:
     first, last = painted[0], painted[-1]
     # Beyond its outermost lines is no road; but beyond a dashed one, or a street's only one, a lane up to the kerb
     right, left = (len(painted) == 1 or here[k][1] == DASHED for k in (first, last))
-    first, last = max(first - right, 0), min(last + left, len(here) - 1)
-    if not here[first][0] < y < here[last][0]:
+    lane_m = bounds[0] - bounds[1]
+    first_m = _outer_m([-at for at, _ in here[first::-1]], lane_m, right)
+    last_m = _outer_m([at for at, _ in here[last:]], lane_m, left)
+    if not -first_m < y < last_m:
         return "off_road"
     if bounds[1] < y < bounds[0]:
         return "ego_lane"
     if abs(body.T_ego_body.yaw_rad) > AGAINST_RAD and math.hypot(*body.velocity_mps) > 1.0:
         return "oncoming"
     return "left" if y >= bounds[0] else "right"
+
+
+def _outer_m(outwards_m: list[float], lane_m: float, has_lane: bool) -> float:
+    """Where a road's lanes end at one side: `outwards_m` is its outermost painted line and what comes after it.
+
+    A truth of lines has none between the last lane and a strip along the kerb in which cars park.
+    """
+    if not has_lane or len(outwards_m) < 2:
+        return outwards_m[0]
+    line, kerb = outwards_m[:2]
+    return line + lane_m if kerb - line - lane_m > PARKED_M else kerb
