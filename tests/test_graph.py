@@ -26,6 +26,7 @@ from birdslam.graph.factors.landmark_points import SHARED_LASTS, LandmarkPoints,
 from birdslam.graph.factors.standard import standard_factors
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
+from birdslam.graph.state_layout import StateLayout
 from birdslam.graph.weights import WeightsConfig
 from birdslam.perf.__main__ import main as perf_main
 from birdslam.perf.latency import incremental, optimizer
@@ -509,7 +510,7 @@ def test_three_thousand_frames_grow_nothing() -> None:
         assert estimate.epoch == 0
         rows.append(len(graph.window.P))  # type: ignore[union-attr]
         landmarks.append(len(on_the_road))
-    assert max(rows) <= 3 + 3 * config.ego_nodes + 6 * 4
+    assert max(rows) <= StateLayout(config.ego_nodes, vehicles=4).size
     assert max(landmarks) <= 6
     gained = graph.map_update()
     assert gained is not None
