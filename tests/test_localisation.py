@@ -2,6 +2,7 @@
 
 import math
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
@@ -81,7 +82,36 @@ def test_a_box_cut_at_the_side_is_placed_by_its_other_edge() -> None:
     assert seen.cut_side
     found = locate(cut, 10.0 - CAR.length_m / 2.0)
     assert found.centre_m[1] == pytest.approx(7.0, abs=0.05)
-    assert found.cov[0, 0] > 10.0 * locate(box_of_car(10.0, 0.0), 10.0 - CAR.length_m / 2.0).cov[0, 0]
+    reach_m = CAR.length_m / 2.0
+    of_face = (0.03 * (10.0 - reach_m)) ** 2
+    assert found.cov[0, 0] == pytest.approx(of_face + (CONFIG.sigma_reach_side_rel * reach_m) ** 2)
+    assert found.cov[0, 0] > 3.0 * locate(box_of_car(10.0, 0.0), 10.0 - reach_m).cov[0, 0]
+
+
+def test_of_a_box_cut_below_too_the_way_to_the_centre_is_least_known() -> None:
+    cut = np.clip(box_of_car(5.0, 3.5), 0.0, [CAMERA.width_px, CAMERA.height_px] * 2)
+    (seen,) = observe([cut])
+    assert seen.cut_side
+    assert seen.sigma_cut is not None
+    (beside,) = observe([np.maximum(box_of_car(10.0, 7.0), 0.0)])
+    assert beside.cut_side
+    assert beside.sigma_cut is None
+    assert CONFIG.sigma_reach_cut_rel > CONFIG.sigma_reach_side_rel > CAR.sigma_length_rel
+    of_reach = [math.sqrt(place(o, math.log(5.0), 0.0, 0.0, CONFIG).cov[0, 0]) for o in (seen, beside)]
+    reach_m = CAR.length_m / 2.0
+    assert of_reach == pytest.approx([CONFIG.sigma_reach_cut_rel * reach_m, CONFIG.sigma_reach_side_rel * reach_m])
+
+
+@pytest.mark.parametrize("near_m", [4.0, 8.0, 30.0])
+def test_a_centre_moves_with_its_face_and_is_as_certain(near_m: float) -> None:
+    reach_m, sigma = CAR.length_m / 2.0, 0.03
+    box = box_of_car(near_m + reach_m, 0.0)
+    (seen,) = observe([box])
+    seen = msgspec.structs.replace(seen, cut_side=False)
+    here, there = (place(seen, math.log(near_m) + d, sigma**2, 0.0, CONFIG) for d in (-1e-4, 1e-4))
+    moved = (there.centre_m[0] - here.centre_m[0]) / 2e-4  # by the log of the face's depth
+    of_length = (CAR.sigma_length_rel * reach_m) ** 2
+    assert here.cov[0, 0] == pytest.approx((moved * sigma) ** 2 + of_length, rel=1e-3)
 
 
 def test_edges_behind_a_nearer_box_are_doubted() -> None:

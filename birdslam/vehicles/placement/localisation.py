@@ -59,7 +59,8 @@ class LocalisationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     # Of a vehicle at the image's side: a box narrower than this, of its outline's width, lacks a part of its length
     cut_width_rel: float = 0.7
     cut_length_rel: float = 1.0  # of its length: what it lacks, by how much narrower its box is
-    sigma_reach_cut_rel: float = 0.75  # 1-sigma of the way to its centre, of that way
+    sigma_reach_side_rel: float = 0.3  # 1-sigma of the way to its centre, of that way, where its lower edge is seen
+    sigma_reach_cut_rel: float = 0.75  # and where the image's bottom cuts it too
     sigma_hidden_rel: float = 0.025  # an edge behind a nearer vehicle is the detector's guess
     cut_margin_px: float = 4.0  # an edge so near to the image's border counts as cut
     # of the box's height, at the image's bottom: detectors draw a cut edge a little inside of it
@@ -230,8 +231,11 @@ def place(seen: Observation, log_depth: float, var_depth: float, yaw_rad: float,
     sigma_across = math.hypot(
         1.0 / math.sqrt(of_left + of_right), lopsided * sigma_half, config.shape_floor_m / max(x_m, 1.0)
     )
-    sigma_reach_m = reach_m * (config.sigma_reach_cut_rel if seen.cut_side else seen.dimensions.sigma_length_rel)
-    along = x_m**2 * var_depth + sigma_reach_m**2
+    sigma_reach_rel = seen.dimensions.sigma_length_rel
+    if seen.cut_side:
+        sigma_reach_rel = config.sigma_reach_side_rel if seen.sigma_cut is None else config.sigma_reach_cut_rel
+    # x_m = depth_m + reach_m, and the depth's error is of the face: the centre does not move by more
+    along = depth_m**2 * var_depth + (sigma_reach_rel * reach_m) ** 2
     return Place(depth_m, np.array([x_m, y_m]), line_of_sight_cov(x_m, y_m, along, (x_m * sigma_across) ** 2))
 
 
