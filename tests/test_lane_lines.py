@@ -378,6 +378,23 @@ def test_a_line_behind_a_car_stays() -> None:
     assert after.sigma_m(10.0) > before.sigma_m(10.0)
 
 
+def test_lines_that_a_car_hides_are_not_lost_for_one_beside_it() -> None:
+    tracker = LineTracker(CAMERA)
+    for k in range(14):
+        pose, near = SE2(1.5 * k, 0.0, 0.0), k >= 8  # a car close ahead, beside which another line comes into view
+        image, masks = picture(pose, (1.75, -1.75, 5.8)[: 3 if near else 2], (True, False, False)[: 3 if near else 2])
+        boxes = NOBODY
+        if near:
+            masks.road[:, 200:], masks.lane[:, 200:] = False, False
+            image[:, 200:] = 60
+            boxes = np.array([[200.0, 0.0, CAMERA.width_px, CAMERA.height_px]])
+        tracker.update(pose, CAMERA.ground, (0.003, 0.0), image, masks, boxes)
+    offsets_m = [line.y_m(10.0) for line in tracker.lines().at(pose) if line.kind is not LineKind.EDGE]
+    for y_m in (1.75, -1.75):
+        assert min(abs(at - y_m) for at in offsets_m) < 0.3
+    assert any(abs(at - 5.8) < 0.4 for at in offsets_m)
+
+
 def test_nothing_is_seen_on_a_bare_road_and_nothing_breaks() -> None:
     image = np.full((CAMERA.height_px, CAMERA.width_px), 90, np.uint8)
     for road in (True, False):

@@ -32,6 +32,7 @@ CERTAIN_M = 5.0  # ... that needs no second image
 APART_M = 0.45  # from a known line
 EDGE_WEIGHT = 0.3  # of an edge's points in the search: side roads and kerbstones bend a mask's border
 MOST_LINES = 9
+IN_VIEW_M = 8.0  # of a line that nothing hides: paint that is there would be seen
 CONFIRMED, MOST_SCORE = 3.0, 8.0
 SEEN_M = 2.0  # of paint: an image has the line
 SAME_M = 0.3  # two lines nearer than this along all of 5 to 20 m are one
@@ -108,7 +109,7 @@ class LineTracker:
         if not len(self._filter):
             return
         points, of, seen = self._correct(view, paint, sigma_pitch_rad, travelled_m, first_tilt_rad, search_tilt)
-        if self._is_lost(paint, seen):
+        if self._is_lost(view, paint, seen):
             self._give_way()
             shape, found = self._search(view, paint, 0.0)
             before = _explained_m(paint, self._tracks, seen)
@@ -202,10 +203,18 @@ class LineTracker:
         )
         return points, of, seen
 
-    def _is_lost(self, paint: LinePoints, seen: list[Support]) -> bool:
-        """Whether most of what a network calls paint lies on none of the lines."""
+    def _is_lost(self, view: RoadView, paint: LinePoints, seen: list[Support]) -> bool:
+        """Whether most of what a network calls paint lies on none of the lines, though these are in view.
+
+        Where vehicles hide all of them, the paint beside is another line's and says nothing of theirs.
+        """
         near_m = float(paint.weight[paint.masked & (paint.x_m < SEARCHED_M)].sum())
-        return near_m > LOST_M and _explained_m(paint, self._tracks, seen) < LOST_SHARE * near_m
+        if near_m <= LOST_M or _explained_m(paint, self._tracks, seen) >= LOST_SHARE * near_m:
+            return False
+        there = (view.x_m > NEAR_M) & (view.x_m < SEARCHED_M)
+        painted = [k for k, track in enumerate(self._tracks) if track.kind == PAINT]
+        in_view_m = [view.row_m[there & self._in_view(view, k)[1]].sum() for k in painted]
+        return not painted or max(in_view_m) > IN_VIEW_M
 
     def _with_edges(self, view: RoadView, paint: LinePoints) -> tuple[LinePoints, Ints]:
         """All points of the image, and the class of each; edges are looked for from the way ahead."""
@@ -223,15 +232,8 @@ class LineTracker:
         """Which lines were seen, over which range, how much of them is paint."""
         contested = self._contested(points, seen)
         for k, (track, support) in enumerate(zip(self._tracks, seen, strict=True)):
-            x = view.x_m
-            # Where the line is in the view, which is of a plane
-            on_road_m, _ = self.tilt.applied(x, np.zeros(len(x)), self._height_m)
-            y = (basis(on_road_m) @ self._filter.curves[k]) * x / on_road_m
-            column = np.round((y - view.y_m[0]) / (view.y_m[1] - view.y_m[0])).astype(np.int64)
-            inside = (column >= 0) & (column < len(view.y_m))
-            at = np.clip(column, 0, len(view.y_m) - 1)
-            rows = np.arange(len(x))
-            clear = inside & ~view.outside[rows, at] & ~view.hidden[rows, at]
+            x, rows = view.x_m, np.arange(len(view.x_m))
+            column, clear = self._in_view(view, k)
             visible_m = float(view.row_m[clear & (x > NEAR_M) & (x < FAR_M)].sum())
             mine = points.of(support.points)
             if track.kind != PAINT:
@@ -251,7 +253,7 @@ class LineTracker:
                     min(track.seen_from_m, float(mine.x_m.min())) if track.looks else float(mine.x_m.min())
                 )
                 track.seen_to_m = max(track.seen_to_m, float(np.quantile(mine.x_m, 0.98)))
-            elif visible_m > 8.0:
+            elif visible_m > IN_VIEW_M:
                 track.score -= GIVES_WAY if k in contested else 1.0
             near = (x > PROFILE_M[0]) & (x < PROFILE_M[1]) & clear
             length_m = float(view.row_m[near].sum())
@@ -271,6 +273,16 @@ class LineTracker:
                     track.double += (double - track.double) / track.resolved
             elif track.kind != PAINT:
                 track.looks += 1.0
+
+    def _in_view(self, view: RoadView, k: int) -> tuple[Ints, NDArray[np.bool_]]:
+        """In each row of the view, which is of a plane: the line's column, and whether nothing hides it there."""
+        x = view.x_m
+        on_road_m, _ = self.tilt.applied(x, np.zeros(len(x)), self._height_m)
+        y = (basis(on_road_m) @ self._filter.curves[k]) * x / on_road_m
+        column = np.round((y - view.y_m[0]) / (view.y_m[1] - view.y_m[0])).astype(np.int64)
+        inside = (column >= 0) & (column < len(view.y_m))
+        at, rows = np.clip(column, 0, len(view.y_m) - 1), np.arange(len(x))
+        return column, inside & ~view.outside[rows, at] & ~view.hidden[rows, at]
 
     def _contested(self, points: LinePoints, seen: list[Support]) -> set[int]:
         """Lines beside which the image has another, sure line's paint: lines of one road neither meet nor cross."""
