@@ -24,7 +24,7 @@ from birdslam.lanes.curves import basis, moved
 from birdslam.lanes.ego_lane import EgoLane
 from birdslam.lanes.line_filter import PLANE_AT_M
 from birdslam.lanes.line_tracker import LineTracker, still_lines
-from birdslam.lanes.occupancy import with_users
+from birdslam.lanes.occupancy import FARTHEST_M, with_users
 from birdslam.lanes.outline import lane_mask, lane_px, line_px
 from birdslam.lanes.paint import RESOLVED_M, LinePoints, paint_points
 from birdslam.lanes.road_view import road_view
@@ -480,6 +480,15 @@ def test_places_of_a_vehicle_sum_to_one(x_m: float, y_m: float, sigma_m: float, 
     vehicle = UserInEgo(7, SE2(x_m, y_m, yaw_rad), np.eye(3) * sigma_m**2, 4.0, 8.0)
     (place,) = with_users(lanes, [vehicle], 10.0, Traffic()).vehicles
     assert place.ego_lane + place.left + place.right + place.oncoming + place.off_road == pytest.approx(1.0)
+
+
+@given(st.lists(st.floats(-400.0, 400.0), max_size=3))
+def test_who_is_far_away_is_in_no_lane(xs_m: list[float]) -> None:
+    """Also where nobody is nearer."""
+    lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0)
+    users = [UserInEgo(k, SE2(x_m, 0.1, 0.0), np.eye(3) * 0.1, 4.0, 8.0) for k, x_m in enumerate(xs_m)]
+    placed = with_users(lanes, users, 10.0, Traffic()).vehicles
+    assert [one.vehicle for one in placed] == [k for k, x_m in enumerate(xs_m) if abs(x_m) < FARTHEST_M]
 
 
 def test_the_leader_is_the_nearest_in_the_egos_lane() -> None:

@@ -20,9 +20,9 @@ BEND_SIGMA_PER_M = 0.002  # 1-sigma of a lane's curvature beyond where it was se
 
 def with_users(lanes: Lanes, users: Sequence[UserInEgo], ego_mps: float, traffic: Traffic) -> Lanes:
     """The lanes with who is in them and which way they run; `ego_mps` is the ego's own speed."""
-    if not lanes.lanes or not users:
-        return traffic.with_directions(lanes)
     near = [user for user in users if abs(user.T_ego_vehicle.x_m) < FARTHEST_M]
+    if not lanes.lanes or not near:
+        return traffic.with_directions(lanes)
     between = lines_between(lanes, near)
     traffic.observe(near, between)
     shares = _shares(lanes.lanes, near)
