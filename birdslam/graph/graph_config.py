@@ -38,7 +38,7 @@ class GraphConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # Of a CV edge's covariance, by how much its error is that of the edge before; lasting_error.py. By the errors of
     # 16 sequences of KITTI tracking with RRC's boxes, the median over tracks: after 0.1 s 0.49 of it along the line of
     # sight and 0.52 across, after 2 s 0.21 and 0.11
-    lasting_share: Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)] = 0.56
+    lasting_share: Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)] = 0.5
     lasting_s: Positive = 2.0  # for so long, of driving
     front_back_ambiguity: bool = True  # a CV edge may take a vehicle's front for its back; False: its yaw is believed
     drives_on: Side = "right"  # the side of the road that traffic keeps to; those who come towards the ego correct it
