@@ -16,6 +16,7 @@ from birdslam.geometry.camera import PLANE_AT_M, Camera, GroundPlane
 Numbers = TypeVar("Numbers", float, Floats)
 
 MAX_RANGE_M = 200.0  # beyond it a pixel row covers tens of metres
+_LEAST_SLOPE = 1e-4  # of a ray that meets the road
 
 
 def meet_road(rays: Floats, fall: Floats, height_m: float) -> Floats:
@@ -33,18 +34,25 @@ def road_slope(depth_m: Numbers, height_m: Numbers | float) -> Numbers:
     return height_m / depth_m
 
 
+def meet_bend(slope: Floats, height_m: float, vertical_per_m: float) -> Floats:
+    """(N,) how far ahead rays of `slope` (N,) meet a road that rises by `vertical_per_m` x^2 / 2: Eq. 1, bent.
+
+    Slopes are against the plane that touches the road under the camera: vertical_per_m x^2 / 2 + slope x = height_m.
+    What lies beyond a crest is put on the ray that touches it.
+    """
+    if vertical_per_m:
+        slope = 0.5 * (slope + np.sqrt(np.maximum(slope * slope + 2.0 * vertical_per_m * height_m, 0.0)))
+    return meet_road(np.ones_like(slope), np.maximum(slope, _LEAST_SLOPE), height_m)
+
+
 def tilted(
     x_m: Floats, y_m: Floats, height_m: float, by_rad: Floats | float, vertical_per_m: float = 0.0
 ) -> tuple[Floats, Floats]:
     """Where points of the road lie if the camera's nose is lower by `by_rad` than it was taken to be (Eq. 1).
 
-    And if the road rises by `vertical_per_m` x^2 / 2 over the plane under the camera: a ray of slope s meets it where
-    vertical_per_m x^2 / 2 + s x = height_m. What lies beyond a crest is put on the ray that touches it.
+    And if the road rises by `vertical_per_m` x^2 / 2 over the plane under the camera.
     """
-    slope = road_slope(x_m, height_m) + by_rad
-    if vertical_per_m:
-        slope = 0.5 * (slope + np.sqrt(np.maximum(slope * slope + 2.0 * vertical_per_m * height_m, 0.0)))
-    x = meet_road(np.ones_like(slope), np.maximum(slope, 1e-4), height_m)
+    x = meet_bend(road_slope(x_m, height_m) + by_rad, height_m, vertical_per_m)
     return x, y_m * x / x_m
 
 
@@ -96,11 +104,12 @@ def pixel_to_ego(camera: Camera, ground: GroundPlane, px: Floats, vertical_per_m
 
     `vertical_per_m` is the road's vertical curvature over the ground.
     """
-    points = (road_point_cam(camera, ground, px) @ ground.R_ego_cam.T)[:, :2]
     if not vertical_per_m:
-        return points
-    tangent_rad = rise(0.0, vertical_per_m)
-    return np.column_stack(tilted(points[:, 0], points[:, 1], ground.height_m, tangent_rad, vertical_per_m))
+        return (road_point_cam(camera, ground, px) @ ground.R_ego_cam.T)[:, :2]
+    bearing, slope = bearing_and_slope(camera, ground, np.atleast_2d(np.asarray(px, dtype=np.float64))).T
+    x = meet_bend(slope + rise(0.0, vertical_per_m), ground.height_m, vertical_per_m)
+    x[x > MAX_RANGE_M] = np.nan
+    return np.column_stack([x, bearing * x])
 
 
 def ego_to_pixel(camera: Camera, ground: GroundPlane, points: Floats) -> Floats:
