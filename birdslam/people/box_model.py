@@ -4,9 +4,8 @@
     log of the height = log(h) - log(X) + log(1 + reach (H + b) / ((X - reach) h)) + foot - head,
     log of the width = log(w) - log(X).
 
-H is the camera's height; the road rises by `rise` over the ego's plane (`bev.rise`), and under the feet lies b lower
-than that (kerb); the nearest foot is at X - reach; a hidden foot lets the box end `foot` of h / X higher. In logarithms
-the derivatives stay the same.
+H is the camera's height; the road rises by `rise` (`bev.rise`), less b under the feet (kerb); the nearest foot is at
+X - reach; a hidden one lets the box end `foot` of h / X higher. In logarithms derivatives stay the same.
 """
 
 from __future__ import annotations
