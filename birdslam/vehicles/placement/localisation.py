@@ -234,9 +234,8 @@ def place(seen: Observation, log_depth: float, var_depth: float, yaw_rad: float,
     # side the nearest face is not seen
     lopsided = (of_left - of_right) / (of_left + of_right)
     half_outline = max(seen.tan_width, outline) / 2.0
-    if (
-        seen.cut_side
-    ):  # the depth's part of it is along that edge's line of sight: what is left is half its extent aside
+    if seen.cut_side:
+        # The depth's part of it is along that edge's line of sight: what is left is half its extent aside
         half_outline = max(y for _, y in corners_of(seen.dimensions, yaw_rad)) / x_m
     sigma_half = seen.dimensions.sigma_width_rel * half_outline
     sigma_across = math.hypot(
