@@ -232,7 +232,14 @@ class FrontEnd:
         """CP edges of the corners on the road."""
         road, (ids, px) = self.vehicles.road, self.odometry.road_tracks
         return landmark_edges(
-            ids, px, frame.frame_id, self.camera, road.ground, road.sigma_pitch_rad, self.config.static_map
+            ids,
+            px,
+            frame.frame_id,
+            self.camera,
+            road.ground,
+            road.sigma_pitch_rad,
+            self.config.static_map,
+            road.vertical_per_m,
         )
 
     def _map_lanes(self, frame: Frame, perception: Perception) -> LaneOutput:

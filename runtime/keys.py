@@ -57,6 +57,8 @@ GROUPS = (
             "camera.tilt_sigma_rad": "How sure are these two angles (1-sigma)? As well as a bracket is screwed on",
             "camera.distortion": "What does the lens bend? OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]]; none: the "
             "images are undistorted",
+            "camera.readout_s": "How long does it take to read an image, from its first row to its last? 0: all rows "
+            "at once (global shutter)",
             "camera.scale_sigma_rel": "How sure are height and focal length, and so all lengths together (1-sigma, a "
             "fraction)? 0: they were measured",
             "camera.fisheye": "Are those numbers k1, k2, k3, k4 of a fisheye lens (equidistant)?",
@@ -75,7 +77,6 @@ GROUPS = (
             "FILE.onnx",
             "models.ROLE.every": "On one image in how many does it run? none: as its manifest says",
             "models.ROLE.threads": "On how many threads? none: as its manifest says",
-            "models.ROLE.awaited": "Does an image wait for it, up to its deadline? none: as its manifest says",
             "models.ROLE.provider": "What computes this one? As perceive.provider; none: as that says",
             "models.shipped": "Does the package's own network run where no other finds vehicles or the road?",
             "models.bodies": "Does the multi-task network look beside another detector, for the depth, length and yaw "

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from birdslam.geometry import bev
-from birdslam.geometry.camera import Camera, GroundPlane, Undistorter
+from birdslam.geometry.camera import PLANE_AT_M, Camera, GroundPlane, Undistorter
 
 KITTI_LIKE = {"width_px": 1242, "height_px": 375, "fx_px": 721.5, "fy_px": 721.5, "cx_px": 609.6, "cy_px": 172.9}
 grounds = st.builds(GroundPlane, st.floats(0.5, 3.0), st.floats(-0.1, 0.1), st.floats(-0.1, 0.1))
@@ -24,6 +24,21 @@ def test_back_projection_undoes_projection(ground: GroundPlane, x_m: float, slop
     p_ego = np.array([[x_m, slope * x_m]])
     px = bev.ego_to_pixel(camera(), ground, p_ego)
     np.testing.assert_allclose(bev.pixel_to_ego(camera(), ground, px), p_ego, rtol=1e-6, atol=1e-6)
+
+
+@given(grounds, st.floats(3.0, 40.0), st.floats(-1.0, 1.0), st.floats(-1e-3, 3e-3))
+def test_back_projection_meets_a_road_that_bends_upwards_or_downwards(
+    ground: GroundPlane, x_m: float, side: float, vertical_per_m: float
+) -> None:
+    """Up to the crest of a road that falls away, which hides what lies beyond."""
+    if vertical_per_m < 0.0:
+        x_m = min(x_m, 0.9 * math.sqrt(2.0 * ground.height_m / -vertical_per_m))
+    height_m = 0.5 * vertical_per_m * x_m * (x_m - PLANE_AT_M)
+    px = bev.ego_to_pixel(camera(), ground, np.array([[x_m, side * x_m, height_m]]))
+    found = bev.pixel_to_ego(camera(), ground, px, vertical_per_m)
+    np.testing.assert_allclose(found, [[x_m, side * x_m]], rtol=1e-5, atol=1e-6)
+    ((_, slope),) = bev.bearing_and_slope(camera(), ground, px)
+    assert bev.RoadProfile(ground.height_m, vertical_per_m).slope(x_m) == pytest.approx(slope, abs=1e-9)
 
 
 def test_equation_1_as_the_paper_writes_it() -> None:

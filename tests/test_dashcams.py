@@ -19,6 +19,7 @@ import pytest
 
 from birdslam.calibration.lens import Lens, self_calibrate
 from birdslam.calibration.lens_windows import CornersOfImage, followed_corners
+from birdslam.calibration.readout import USUAL
 from birdslam.geometry.camera import Undistorter
 from birdslam.odometry.odometry import Odometry
 from birdslam.perf.accuracy.drives import is_valid
@@ -42,7 +43,7 @@ def images_of(name: str) -> list[np.ndarray]:
 def lens_of(name: str, prior: float) -> tuple[Lens | None, float]:
     """What the film shows with a focal length beforehand that is off by a factor; and the error of the found one."""
     camera = load_camera(FILMS / f"{name}.toml")
-    corners = followed_corners(((image, NO_BOXES) for image in images_of(name)), camera)
+    corners = followed_corners(((image, NO_BOXES, 0.1 * k) for k, image in enumerate(images_of(name))), camera)
     some = [CornersOfImage(each.ids, each.px) for each in corners]
     lens = self_calibrate(some, (camera.width_px, camera.height_px), prior * camera.fx_px, PRIOR_SIGMA)
     return lens, 0.0 if lens is None else math.log(lens.focal_px / camera.fx_px)
@@ -84,7 +85,7 @@ def ways(name: str) -> tuple[float, float, float, list[bool]]:
             true_m += float(np.linalg.norm(at_m[k] - at_m[motion.from_frame]))
             sigmas.append(motion.scale_sigma_rel)
     speed_mps = float(np.linalg.norm(np.diff(at_m, axis=0), axis=1).mean()) * 10.0
-    shutter = shutter_rel(camera, camera.height_m, speed_mps)
+    shutter = shutter_rel(camera, camera.height_m, speed_mps, USUAL.sigma_s)
     sigma_rel = math.hypot(float(np.median(sigmas)), shutter) if sigmas else math.inf
     return (way_m / true_m if true_m else math.nan), sigma_rel, speed_mps, valid
 

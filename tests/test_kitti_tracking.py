@@ -42,6 +42,20 @@ def test_camera_2_stands_beside_camera_0(tmp_path: Path) -> None:
     assert sequence.vehicle_truth(label, 0).y_m == pytest.approx(-43.3 / tracking_world.FX)  # now further right
 
 
+@pytest.mark.parametrize(
+    ("focal_px", "size_px"), [(721.5377, (1242, 375)), (707.0493, (1224, 370)), (718.856, (1241, 376))]
+)
+def test_images_that_are_not_there_have_the_size_of_their_day(
+    tmp_path: Path, focal_px: float, size_px: tuple[int, int]
+) -> None:
+    root = tracking_world.write(tmp_path)
+    path = root / "calib" / "0002.txt"
+    path.write_text(path.read_text().replace(str(tracking_world.FX), str(focal_px)))
+    camera = open_tracking(root, "0002").camera
+    assert camera.fx_px == focal_px
+    assert (camera.width_px, camera.height_px) == size_px
+
+
 def test_detections_by_frame_best_first(tmp_path: Path) -> None:
     folder = tmp_path / "det"
     (folder / "Car").mkdir(parents=True)

@@ -102,6 +102,20 @@ def test_of_a_box_cut_below_too_the_way_to_the_centre_is_least_known() -> None:
     assert of_reach == pytest.approx([CONFIG.sigma_reach_cut_rel * reach_m, CONFIG.sigma_reach_side_rel * reach_m])
 
 
+def test_a_centre_by_one_edge_moves_along_that_edges_line_of_sight() -> None:
+    x_m, y_m = 5.6, 4.4  # an oncoming car: the edge that is seen is of its far end
+    cut = np.clip(box_of_car(x_m, y_m), 0.0, [CAMERA.width_px, CAMERA.height_px] * 2)
+    (seen,) = observe([cut])
+    assert seen.cut_side
+    found = locate(cut, x_m - CAR.length_m / 2.0)
+    of_edge = (y_m - CAR.width_m / 2.0) / (x_m + CAR.length_m / 2.0)
+    assert found.cov[0, 1] / found.cov[0, 0] == pytest.approx(of_edge, rel=0.05)
+    farther = locate(cut, x_m - CAR.length_m / 2.0 + 1.0)
+    dx_m, dy_m = farther.centre_m - found.centre_m
+    assert dy_m / dx_m == pytest.approx(of_edge, rel=0.05)
+    assert found.centre_m[1] / found.centre_m[0] > 1.5 * of_edge  # no error is along the centre's own line
+
+
 @pytest.mark.parametrize("near_m", [4.0, 8.0, 30.0])
 def test_a_centre_moves_with_its_face_and_is_as_certain(near_m: float) -> None:
     reach_m, sigma = CAR.length_m / 2.0, 0.03

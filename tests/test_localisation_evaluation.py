@@ -146,3 +146,29 @@ def test_constants_of_the_command_line_count_in_paper_mode_too(tmp_path: Path) -
     at_face, at_centre = ([row["depth_bias_median_rel"] for row in rows[reach] if row["n"]] for reach in ("0.0", "1.0"))
     assert at_face  # Eq. 1 puts the nearest face where the centre should be
     assert all(face < centre for face, centre in zip(at_face, at_centre, strict=True))
+
+
+def test_draws_of_the_tilt_count_together(tmp_path: Path) -> None:
+    root = tracking_world.write(tmp_path / "root")
+    found = {}
+    for draws in ("1", "2"):
+        asked = ["--draws", draws, "--output", str(tmp_path / draws)]
+        assert main(["evaluate", "localisation", str(root), *asked]) == 0
+        rows = json.loads((tmp_path / draws / "report.json").read_text())
+        movers = json.loads((tmp_path / draws / "movers.json").read_text())
+        found[draws] = {(row["sequence"], row["range"]): row for row in rows if row["n"]}, movers
+    (once, movers), (twice, of_two) = found["1"], found["2"]
+    assert [2 * row["n"] for row in once.values()] == [row["n"] for row in twice.values()]
+    assert [2 * row["standing"] + 2 * row["driving"] for row in movers] == [
+        row["standing"] + row["driving"] for row in of_two
+    ]
+    assert any(once[key]["depth_rms_rel"] != row["depth_rms_rel"] for key, row in twice.items())
+
+
+@pytest.mark.parametrize("asked", [["0"], ["2", "--class", "pedestrian"], ["2", "--tilt", "none"]])
+def test_draws_that_there_are_not_are_refused(
+    asked: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = tracking_world.write(tmp_path / "root")
+    assert main(["evaluate", "localisation", str(root), "--draws", *asked, "--output", str(tmp_path / "out")]) == 2
+    assert "--draws" in capsys.readouterr().err

@@ -13,6 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from birdslam.geometry import bev
+from birdslam.geometry.bev import RoadProfile
+from birdslam.geometry.camera import VerticalCurvature
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.around.approach import approaches
 from birdslam.graph.around.hidden_road import hidden_fans
@@ -77,12 +79,12 @@ class Scene:
     def ego_m(self) -> float:
         return self.ego_mps * self.k / HZ
 
-    def see(self, detections: Detections | None) -> tuple[FollowedPerson, ...]:
+    def see(self, detections: Detections | None, road: GroundSizeFilter = ROAD) -> tuple[FollowedPerson, ...]:
         """The next frame."""
         ego = EgoFrame(self.k, round(self.k * 1e9 / HZ), SE2(self.ego_m, 0.0, 0.0), np.zeros((3, 3)))
         dt_s = 0.0 if self.k == 0 else 1.0 / HZ
         frame = OpenFrame(ego, dt_s, 0.0, None, None, self.ego_mps * dt_s)
-        self.tracker.settle(frame, detections, ROAD)
+        self.tracker.settle(frame, detections, road)
         self.k += 1
         return followed_people(self.tracker, ego)
 
@@ -182,14 +184,31 @@ def test_near_ones_tell_how_tall_all_are_and_far_ones_the_tilt_and_nobody_tells_
     road.predict(1.0, 0.0, 0.02)
     road.begin(len(seen))
     before = road.by_others()
-    road.tell(range(1), seen[:1], camera_m)
+    road.tell(range(1), seen[:1], RoadProfile(camera_m))
     np.testing.assert_array_equal(road.by_others()[0], before[0])
-    road.tell(range(1, len(seen)), seen[1:], camera_m)
+    road.tell(range(1, len(seen)), seen[1:], RoadProfile(camera_m))
     (tilt, tilt_var), (log_height, height_var) = road.by_others()[-1].tolist()
     assert abs(tilt - 0.02) < 2.0 * math.sqrt(tilt_var) < 0.02
     assert 0.02 < log_height < 0.08 + math.sqrt(height_var)
     road.predict(1.0, 0.005, 0.02)  # the front end's ground now has a part of it
     assert road.by_others()[-1, 0, 0] == pytest.approx(tilt - 0.005, abs=1e-3)
+
+
+def test_people_on_a_road_that_bends_stand_where_its_rise_puts_them() -> None:
+    """A sag as the lanes tell it: over its plane the feet would lie 4 m too far."""
+    bend, x_m = 2e-3, 30.0
+    box = box_of(x_m, 1.0, rise=bev.rise(x_m - 0.25, bend))
+    bent = GroundSizeFilter(CAMERA, GroundSizeConfig())
+    bent.predict(0.1, 0.0, None, None, 1.0, VerticalCurvature(bend, 1e-5))
+    places = []
+    for road in (ROAD, bent):
+        scene = Scene()
+        for _ in range(10):
+            people = scene.see(found([box]), road=road)
+        places.append(people[0].x_m)
+    level_m, bent_m = places
+    assert bent_m == pytest.approx(x_m, rel=0.04)
+    assert level_m > bent_m + 1.0
 
 
 def test_feet_that_the_images_border_cuts_tell_no_place() -> None:

@@ -78,6 +78,18 @@ def test_a_new_weight_is_what_a_prior_of_that_weight_would_have_given() -> None:
     assert np.linalg.inv(information)[1, 1] == pytest.approx(P[1, 1], rel=0.1)
 
 
+def test_another_prior_is_as_if_the_vehicle_had_begun_with_it() -> None:
+    prior, x, P = born()
+    x, P = measured(x, P, math.log(1.55), 0.05)
+    changed_x, changed_P = prior.replace(0, x, P, (1, 0), 2.1, 0.12)
+    own = 0.12**2 - COMMON**2
+    _, fresh_x, fresh_P = born()
+    fresh_x[1], fresh_P[1, 1] = math.log(2.1), own + COMMON**2
+    fresh_x, fresh_P = measured(fresh_x, fresh_P, math.log(1.55), 0.05)
+    assert changed_x == pytest.approx(fresh_x)
+    assert changed_P == pytest.approx(fresh_P)
+
+
 def test_a_roll_of_the_images_that_is_off_for_long_stays_in_the_sigma() -> None:
     ground_size = GroundSizeFilter(CAMERA, GroundSizeConfig())
     for k in range(300):

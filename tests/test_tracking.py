@@ -151,6 +151,32 @@ def test_labels_are_voted_and_false_alarms_get_no_id() -> None:
     assert tracks[0].vehicle == 0
 
 
+def test_a_car_that_one_box_calls_a_truck_stays_as_large_and_where_it_is() -> None:
+    drive, car = Drive(), [SE2(20.0, 0.0, 0.0)]
+    for _ in range(6):
+        tracks = drive.step(SE2(), car)
+    before = tracks[0].observation.dimensions
+    width = drive.ground_size.size(0)[1]
+    (now,) = drive.step(SE2(), car, ["truck"])
+    assert now.observation.dimensions == before
+    assert now.pose().x_m == pytest.approx(20.0, abs=0.3)
+    assert drive.ground_size.size(0)[1] == pytest.approx(width, rel=0.02)
+
+
+def test_a_car_that_was_first_called_a_truck_gets_the_prior_of_a_car() -> None:
+    ways = [["car"] * 8, ["truck", *["car"] * 7]]
+    heights, outlines = [], []
+    for labels in ways:
+        drive = Drive()
+        for k, label in enumerate(labels):
+            drive.step(SE2(), [SE2(20.0 - k, 0.0, 0.0)], [label])
+        height_m, outline = drive.ground_size.size(0)
+        heights.append(height_m)
+        outlines.append(outline)
+    assert heights[1] == pytest.approx(heights[0], rel=0.04)
+    assert outlines[1] == pytest.approx(outlines[0], rel=0.05)
+
+
 def test_a_place_by_depth_counts_by_its_covariance() -> None:
     def after(sigma_m: float | None) -> tuple[float, float]:
         drive = Drive()

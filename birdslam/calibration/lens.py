@@ -33,7 +33,7 @@ from birdslam.geometry.pose import rotation_log
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_SIGMA_PX = 0.5  # of a corner, by pixels of a lens of FOCAL_PX
+SIGMA_PX = 0.5  # of a corner, by pixels of a lens of FOCAL_PX
 _LEAST_TURN_RAD = math.radians(30.0)  # a drive that turns less shows no focal length: of 19 real ones eleven did not
 _BEGUN = -1.0, 0.0, 1.0  # where the focal length is looked for from, in sigmas of what is known of it
 _ROUGHLY = 1e-4  # how far each is adjusted
@@ -104,7 +104,7 @@ def self_calibrate(
         k1_before = k1_by_bend(bend, focal_px / size_px[0])
     middle = 0.5 * (np.array(size_px, dtype=np.float64) - 1.0)
     windows = windows_of(images, middle, focal_px)
-    sigma_px = _SIGMA_PX * focal_px / FOCAL_PX
+    sigma_px = SIGMA_PX * focal_px / FOCAL_PX
     begun = begin(windows, focal_px, k1_before[0], sigma_px, fisheye, k1_before)
     if begun is None:
         return None
@@ -112,17 +112,17 @@ def self_calibrate(
     again = begin(windows, focal_px, fitted.k1, sigma_px, fisheye, k1_before)
     fitted = fitted if again is None else adjust(again)
     prior = FocalPrior(math.log(focal_px), focal_sigma_rel)
-    turned_rad, sigmas = _turned_rad(fitted), _sigmas(fitted, prior)
+    turned_rad, sigmas = _turned_rad(fitted), sigmas_of(fitted, prior)
     if by_view:
         k1_sigma, edge2 = min(float(sigmas[0]), k1_before[1]), (0.5 * size_px[0] / focal_px) ** 2
         distorts = math.log(max(1.0 + fitted.k1 * edge2, 0.3))
         focal_sigma_rel = math.hypot(focal_sigma_rel, distorts, k1_sigma * edge2)
         prior = FocalPrior(math.log(focal_px), focal_sigma_rel)
-        sigmas = _sigmas(fitted, prior)
+        sigmas = sigmas_of(fitted, prior)
     shown = False
     if turned_rad > _LEAST_TURN_RAD:
         found = _with_focal_length(windows, fitted, prior)
-        sigmas_found = _sigmas(found, prior)
+        sigmas_found = sigmas_of(found, prior)
         shown = bool(max(sigmas_found[1], LEAST_SIGMA_REL) < _SHOWN * focal_sigma_rel)
         fitted, sigmas = (found, sigmas_found) if shown else (fitted, sigmas)
     if shown:
@@ -156,8 +156,8 @@ def _with_focal_length(windows: Sequence[Window], fitted: LensProblem, prior: Fo
     return best if again is None else adjust(again, prior)
 
 
-def _sigmas(problem: LensProblem, prior: FocalPrior) -> Floats:
-    """(2,) 1-sigma of k1 and of the log of the focal length.
+def sigmas_of(problem: LensProblem, prior: FocalPrior) -> Floats:
+    """(3,) 1-sigma of `LensProblem.shared`: k1, the log of the focal length, the readout in s.
 
     What the lens is without each part of the drive, and without each part of the image, in one step from here. Windows
     beside each other share images and bends, so parts of the drive are whole; a lens that is no such lens (a second
@@ -175,16 +175,16 @@ def _sigmas(problem: LensProblem, prior: FocalPrior) -> Floats:
 
 
 def _jackknife(problem: LensProblem, prior: FocalPrior, parts: Ints) -> Floats:
-    """(2,) variance by what the lens is without each part (P,) of the corners."""
+    """(3,) variance by what the lens is without each part (P,) of the corners."""
     each = np.unique(parts)
     if len(each) < 2:
-        return np.zeros(2)
+        return np.zeros(3)
     without = np.array([_shared_without(problem, prior, parts != one) for one in each])
     out: Floats = (len(each) - 1) / len(each) * np.square(without - without.mean(axis=0)).sum(axis=0)
     return out
 
 
 def _shared_without(problem: LensProblem, prior: FocalPrior, some: NDArray[np.bool_]) -> Floats:
-    """(k1, log of the focal length) by some of the corners (P,); by what is known beforehand where few are left."""
+    """`LensProblem.shared` by some of the corners (P,); by what is known beforehand where few are left."""
     left = some_corners(problem, some)
-    return shared_by(left, prior)[0] if len(left.R) else np.array([0.0, prior.log_focal])
+    return shared_by(left, prior)[0] if len(left.R) else np.array([0.0, prior.log_focal, problem.readout_before[0]])

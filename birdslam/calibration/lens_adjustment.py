@@ -1,7 +1,9 @@
 """Bundle adjustment of short windows of images together with the lens that they share: focal length and distortion.
 
 Each corner has three numbers, so that no image's noise is taken for the truth. Normal equations are reduced twice: by
-the corners, and by each window's poses, since windows share the lens alone.
+the corners, and by each window's poses, since windows share the lens alone. The lens has the time with it that the
+camera takes to read its rows, one after the other: each corner is where it is seen from at its own row's time (Hedborg
+et al., "Rolling shutter bundle adjustment", CVPR 2012), the camera going on as between its window's images.
 """
 
 from __future__ import annotations
@@ -19,11 +21,13 @@ Ints = NDArray[np.int64]
 
 IMAGES = 6  # of a window
 SIGMA_K1 = 0.3  # beforehand: dashboard cameras have -0.4 to 0
+HELD = 1e-6  # 1-sigma of what is held
+SHARED = 3  # numbers that all windows share
 _HUBER = 1.5  # sigmas
 _ITERATIONS = 30
 _CONVERGED = 1e-6  # relative change of the cost
 _LEAST_LEFT = 8  # corners of a window, whose poses have 30 numbers
-_HELD = 1e-6  # 1-sigma of a focal length that is held
+_LEAST_S = 1e-3  # between two images
 _NEAREST, _BEHIND_COST = 1e-3, 1e3  # a corner is no nearer; what one behind the camera costs
 
 
@@ -32,7 +36,9 @@ class LensProblem:
     """What is adjusted: P corners, each of a window w; observed at px (P, IMAGES, 2), from the image's middle."""
 
     px: Floats
+    row: Floats  # (P, IMAGES) of the image they were read in: -0.5 the first, 0.5 the last
     of: Ints  # (P,) window of each corner
+    t_s: Floats  # (W, IMAGES) when the middle row of each image was read
     R: Floats  # (W, IMAGES, 3, 3) from the window's first camera to each
     t: Floats  # (W, IMAGES, 3)
     corner: Floats  # (P, 3) x / z, y / z, 1 / z in the window's first camera
@@ -41,11 +47,13 @@ class LensProblem:
     sigma_px: float  # of a corner: a larger image has it in more pixels, whatever its lens turns out to be
     fisheye: bool = False  # the radius grows with the angle from the axis, and not with its tangent
     k1_before: tuple[float, float] = (0.0, SIGMA_K1)  # what is known of k1 beside the corners, with its 1-sigma
+    readout_s: float = 0.0  # from the first row to the last
+    readout_before: tuple[float, float] = (0.0, HELD)  # what is known of it, with its 1-sigma
 
     @property
     def shared(self) -> Floats:
-        """(2,) what all windows share: k1, and the log of the focal length."""
-        return np.array([self.k1, self.log_focal])
+        """(3,) what all windows share: k1, the log of the focal length, and the readout in s."""
+        return np.array([self.k1, self.log_focal, self.readout_s])
 
 
 @dataclass(frozen=True)
@@ -82,7 +90,9 @@ def some_corners(problem: LensProblem, some: NDArray[np.bool_]) -> LensProblem:
     return replace(
         problem,
         px=problem.px[some],
+        row=problem.row[some],
         of=np.searchsorted(windows, problem.of[some]),
+        t_s=problem.t_s[windows],
         R=problem.R[windows],
         t=problem.t[windows],
         corner=problem.corner[some],
@@ -117,7 +127,7 @@ def cost_of(problem: LensProblem, prior: FocalPrior) -> float:
 
 
 def shared_by(problem: LensProblem, prior: FocalPrior | None) -> tuple[Floats, Floats]:
-    """(k1, log of the focal length) by one step of Gauss and Newton from here, and their information (2, 2)."""
+    """`LensProblem.shared` by one step of Gauss and Newton from here, and its information (3, 3)."""
     system = _linearise(problem, prior)[1]
     information, gradient, *_ = _reduced(system, 0.0)
     return problem.shared - np.linalg.solve(information, gradient), information
@@ -125,7 +135,7 @@ def shared_by(problem: LensProblem, prior: FocalPrior | None) -> tuple[Floats, F
 
 @dataclass(frozen=True)
 class _System:
-    """Normal equations of the corners, and of each window's poses with the lens last, V = 6 (IMAGES - 1) + 2."""
+    """Normal equations of the corners, and of each window's poses with the lens last, V = 6 (IMAGES - 1) + SHARED."""
 
     of: Ints  # (P,) window of each corner
     corner: Floats  # (P, 3, 3)
@@ -133,17 +143,35 @@ class _System:
     view: Floats  # (W, V, V)
     corner_gradient: Floats  # (P, 3)
     view_gradient: Floats  # (W, V)
-    prior: Floats  # (2, 2) information of what is known of the lens beforehand
-    prior_gradient: Floats  # (2,)
+    prior: Floats  # (3, 3) information of what is known of the lens beforehand
+    prior_gradient: Floats  # (3,)
 
 
-def _project(problem: LensProblem) -> tuple[Floats, Floats, Floats]:
-    """Rays turned into each image (P, I, 3), places q (P, I, 3), and normalised coordinates u (P, I, 2)."""
+def _project(problem: LensProblem) -> tuple[Floats, Floats, Floats, Floats]:
+    """Rays turned into each image (P, I, 3), places q (P, I, 3) when each corner's row was read, normalised coordinates
+    u (P, I, 2), and how q goes with the readout (P, I, 3)."""
     rays = np.concatenate([problem.corner[:, :2], np.ones((len(problem.corner), 1))], axis=1)
     turned = np.einsum("pikl,pl->pik", problem.R[problem.of], rays)
     q = turned + problem.corner[:, 2, None, None] * problem.t[problem.of]
+    turn, shift = (rate[problem.of] for rate in _rates(problem))
+    by_readout = problem.row[..., None] * (np.cross(turn, q) + problem.corner[:, 2, None, None] * shift)
+    q = q + problem.readout_s * by_readout
     u = q[..., :2] / np.maximum(q[..., 2:], _NEAREST)
-    return turned, q, u
+    return turned, q, u, by_readout
+
+
+def _rates(problem: LensProblem) -> tuple[Floats, Floats]:
+    """How the world turns, in rad/s, and shifts, a second, in the axes of each image: (W, IMAGES, 3) each.
+
+    By the images before and after it; a turn between two images is small enough to be its sine.
+    """
+    R, t = problem.R, problem.t
+    step = R[:, 1:] @ R[:, :-1].transpose(0, 1, 3, 2)
+    dt_s = np.maximum(np.diff(problem.t_s), _LEAST_S)[..., None]
+    turn = 0.5 * np.stack([step[..., b, a] - step[..., a, b] for a, b in ((1, 2), (2, 0), (0, 1))], axis=-1) / dt_s
+    shift = (t[:, 1:] - np.einsum("wkij,wkj->wki", step, t[:, :-1])) / dt_s
+    turn, shift = (np.concatenate([x[:, :1], 0.5 * (x[:, 1:] + x[:, :-1]), x[:, -1:]], axis=1) for x in (turn, shift))
+    return turn, shift
 
 
 def _distorted(problem: LensProblem, u: Floats) -> tuple[Floats, Floats, Floats]:
@@ -172,13 +200,14 @@ def _huber(problem: LensProblem, q: Floats, d: Floats) -> tuple[Floats, Floats, 
 
 def _linearise(problem: LensProblem, prior: FocalPrior | None) -> tuple[float, _System]:
     """The cost and the normal equations at the present values."""
-    prior = prior or FocalPrior(problem.log_focal, _HELD)
-    turned, q, u = _project(problem)
+    prior = prior or FocalPrior(problem.log_focal, HELD)
+    turned, q, u, q_readout = _project(problem)
     d, d_u, d_k1 = _distorted(problem, u)
     r, weight, each = _huber(problem, q, d)
     focal_px, sigma_px = math.exp(problem.log_focal), problem.sigma_px
     k1, sigma_k1 = problem.k1_before
-    known = np.array([k1, prior.log_focal]), np.array([sigma_k1, prior.sigma]) ** -2.0
+    readout_s, sigma_s = problem.readout_before
+    known = np.array([k1, prior.log_focal, readout_s]), np.array([sigma_k1, prior.sigma, sigma_s]) ** -2.0
     away = problem.shared - known[0]
     cost = float(each.sum()) + 0.5 * float(known[1] @ away**2)
 
@@ -193,10 +222,11 @@ def _linearise(problem: LensProblem, prior: FocalPrior | None) -> tuple[float, _
     )
     J_turn = np.cross(turned[:, :, None, :], J_q)  # d q / d w = -[turned]x
     J_pose = np.concatenate([J_turn, J_q * problem.corner[:, 2, None, None, None]], axis=-1)[:, 1:]
-    J_lens = focal_px / sigma_px * np.stack([d_k1, d], axis=-1)
+    J_readout = np.einsum("pick,pik->pic", J_q, q_readout)
+    J_lens = np.concatenate([focal_px / sigma_px * np.stack([d_k1, d], axis=-1), J_readout[..., None]], axis=-1)
 
     P, poses = len(r), 6 * (IMAGES - 1)
-    by_image = np.zeros((P, IMAGES, 2, poses + 2))
+    by_image = np.zeros((P, IMAGES, 2, poses + SHARED))
     for k in range(1, IMAGES):
         by_image[:, k, :, 6 * (k - 1) : 6 * k] = J_pose[:, k - 1]
     by_image[..., poses:] = J_lens
@@ -209,7 +239,7 @@ def _linearise(problem: LensProblem, prior: FocalPrior | None) -> tuple[float, _
     last = slice(poses - 3, poses)
     for k, way in enumerate(problem.t[:, -1]):
         view[k, last, last] += 1e4 * np.outer(way, way) / float(way @ way)
-    view += 1e-3 * np.eye(poses + 2)  # nothing, but where all corners of a window are outliers
+    view += 1e-3 * np.eye(poses + SHARED)  # nothing, but where all corners of a window are outliers
     corner = (J_corner * w).transpose(0, 2, 1) @ J_corner + 1e-6 * np.eye(3)
     return cost, _System(
         of=problem.of,
@@ -233,17 +263,17 @@ def _summed_by_window(of: Ints, a: Floats, b: Floats) -> Floats:
 def _reduced(system: _System, damping: float) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """Corners are eliminated first (Schur), then each window's poses by themselves, since windows share the lens alone.
 
-    Information (2, 2) and gradient (2,) of the lens; how poses follow it (W, V - 2, 2) and what they are without it
-    (W, V - 2); inverse of the corners' (P, 3, 3).
+    Information (3, 3) and gradient (3,) of the lens; how poses follow it (W, V - 3, 3) and what they are without it
+    (W, V - 3); inverse of the corners' (P, 3, 3).
     """
     inverse = np.asarray(np.linalg.inv(system.corner * (1.0 + damping * np.eye(3))), np.float64)
     part = inverse @ system.corner_by_view
     view = system.view * (1.0 + damping * np.eye(system.view.shape[-1]))
     view = view - _summed_by_window(system.of, system.corner_by_view, part)
     gradient = system.view_gradient - _summed_by_window(system.of, part, system.corner_gradient[..., None])[..., 0]
-    poses, lens = slice(None, -2), slice(-2, None)
+    poses, lens = slice(None, -SHARED), slice(-SHARED, None)
     solved = np.linalg.solve(view[:, poses, poses], np.concatenate([view[:, poses, lens], gradient[:, poses, None]], 2))
-    by_lens, alone = solved[..., :2], solved[..., 2]
+    by_lens, alone = solved[..., :SHARED], solved[..., SHARED]
     information = np.asarray(
         (view[:, lens, lens] - view[:, lens, poses] @ by_lens).sum(axis=0) + system.prior, np.float64
     )
@@ -252,7 +282,7 @@ def _reduced(system: _System, damping: float) -> tuple[Floats, Floats, Floats, F
 
 
 def _solve(system: _System, damping: float) -> tuple[Floats, Floats, Floats]:
-    """Steps of the poses (W, IMAGES - 1, 6), of the lens (2,) and of the corners (P, 3)."""
+    """Steps of the poses (W, IMAGES - 1, 6), of the lens (3,) and of the corners (P, 3)."""
     information, gradient, by_lens, alone, inverse = _reduced(system, damping)
     lens = np.asarray(-np.linalg.solve(information, gradient), np.float64)
     poses = np.asarray(-alone - by_lens @ lens, np.float64)
@@ -272,5 +302,7 @@ def _moved(problem: LensProblem, poses: Floats, lens: Floats, corner: Floats) ->
             window[k] = rotation_exp(step[:3]) @ window[k]
     moved = problem.corner + corner
     moved[:, 2] = np.maximum(moved[:, 2], 0.0)
-    k1, log_focal = problem.shared + np.clip(lens, -0.2, 0.2)
-    return replace(problem, R=R, t=t, corner=moved, k1=float(k1), log_focal=float(log_focal))
+    k1, log_focal, readout_s = problem.shared + np.clip(lens, -0.2, 0.2)
+    return replace(
+        problem, R=R, t=t, corner=moved, k1=float(k1), log_focal=float(log_focal), readout_s=float(readout_s)
+    )

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.calibration.lens_adjustment import IMAGES, LensProblem
+from birdslam.calibration.lens_adjustment import HELD, IMAGES, LensProblem
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import rotation_log
 from birdslam.odometry.corners.feature_tracks import FeatureConfig, FeatureTracker
@@ -29,6 +29,7 @@ _MOST_WINDOWS = 40
 _LEAST_WINDOWS = 4
 _LEAST_CORNERS = 20  # of a window
 _MOST_CORNERS = 100
+_NEAR_CORNERS = 60  # of these, where the nearest are asked for
 _TWO_VIEW_PX = 1.5  # outliers' limit of the first poses, by pixels of a lens of FOCAL_PX
 FOCAL_PX = 720.0
 _MOST_TURN_RAD = 0.8  # of a window
@@ -38,33 +39,41 @@ _WIDEST_RAD = 1.45  # from the axis, of a corner
 
 @dataclass(frozen=True)
 class CornersOfImage:
-    """Followed corners of one raw image: ids (N,) ascending, px (N, 2)."""
+    """Followed corners of one raw image: ids (N,) ascending, px (N, 2); `t_s` is when its middle row was read."""
 
     ids: Ints
     px: Floats
+    t_s: float = 0.0
 
 
-def followed_corners(images: Iterable[tuple[NDArray[np.uint8], Floats]], camera: Camera) -> list[CornersOfImage]:
-    """Corners of a camera's raw images, followed from each to the next, outside the boxes (B, 4) of vehicles in each.
+def followed_corners(images: Iterable[tuple[NDArray[np.uint8], Floats, float]], camera: Camera) -> list[CornersOfImage]:
+    """Corners of a camera's raw images, each with its boxes (B, 4) of vehicles and its time in s.
+
+    They are followed from each image to the next, outside these boxes.
 
     Of the camera only its size and about its focal length count.
     """
     out: list[CornersOfImage] = []
     resolution = WorkingResolution(camera)
     tracker = FeatureTracker(resolution.camera.width_px, resolution.camera.height_px, FeatureConfig())
-    for image, boxes_px in images:
+    for image, boxes_px, t_s in images:
         tracks = tracker.track(resolution.image(image))
         tracker.accept(tracks)
         static = outside(tracks.px, resolution.boxes_px(boxes_px))
-        out.append(CornersOfImage(tracks.ids[static], resolution.given_px(tracks.px[static])))
+        out.append(CornersOfImage(tracks.ids[static], resolution.given_px(tracks.px[static]), t_s))
     return out
 
 
 @dataclass(frozen=True)
 class Window:
-    """Corners that all images of one window show, px (IMAGES, N, 2)."""
+    """Corners that all images of one window show, px (IMAGES, N, 2) from the middle; the images' times (IMAGES,).
+
+    `row` (IMAGES, N): where in the raw image each was read, -0.5 in its first row to 0.5 in its last.
+    """
 
     px: Floats
+    row: Floats
+    t_s: Floats
 
 
 def windows_of(images: Sequence[CornersOfImage], middle: Floats, focal_px: float) -> list[Window]:
@@ -76,7 +85,15 @@ def windows_of(images: Sequence[CornersOfImage], middle: Floats, focal_px: float
     return windows
 
 
-def _apart(images: Sequence[CornersOfImage], middle: Floats, step_px: float, share: float) -> list[Window]:
+def near_windows(images: Sequence[CornersOfImage], middle: Floats, focal_px: float) -> list[Window]:
+    """As `windows_of`, of images so close to each other that the nearest corners are in all of a window's."""
+    step_rad, share = _STEPS_RAD[-1]
+    return _apart(images, middle, step_rad * focal_px, share, nearest=True)
+
+
+def _apart(
+    images: Sequence[CornersOfImage], middle: Floats, step_px: float, share: float, nearest: bool = False
+) -> list[Window]:
     """Windows of the drive, each of images between which a share of the corners has moved by a step."""
     found, first = [], 0
     while first < len(images) - IMAGES:
@@ -92,7 +109,7 @@ def _apart(images: Sequence[CornersOfImage], middle: Floats, step_px: float, sha
         if len(at) < IMAGES:
             first += 1
             continue
-        window = _common(images, at, middle, step_px / _STEPS_RAD[0][0] * _FIXED_RAD)
+        window = _common(images, at, middle, step_px / _STEPS_RAD[0][0] * _FIXED_RAD, nearest)
         if window is not None:
             found.append(window)
         first = at[IMAGES // 2]
@@ -107,17 +124,27 @@ def _flow_px(a: CornersOfImage, b: CornersOfImage) -> Floats:
     return out
 
 
-def _common(images: Sequence[CornersOfImage], at: Sequence[int], middle: Floats, fixed_px: float) -> Window | None:
+def _common(
+    images: Sequence[CornersOfImage], at: Sequence[int], middle: Floats, fixed_px: float, nearest: bool
+) -> Window | None:
     ids = images[at[0]].ids
     for k in at[1:]:
         ids = np.intersect1d(ids, images[k].ids, assume_unique=True)
     first, last = (images[k].px[np.searchsorted(images[k].ids, ids)] for k in (at[0], at[-1]))
-    ids = ids[np.linalg.norm(last - first, axis=1) > fixed_px]
+    moved = np.linalg.norm(last - first, axis=1)
+    ids, moved = ids[moved > fixed_px], moved[moved > fixed_px]
     if len(ids) < _LEAST_CORNERS:
         return None
     if len(ids) > _MOST_CORNERS:  # evenly over their ids, which are those of all parts of the image
-        ids = ids[np.linspace(0, len(ids) - 1, _MOST_CORNERS).astype(int)]
-    return Window(np.array([images[k].px[np.searchsorted(images[k].ids, ids)] - middle for k in at]))
+        some = np.linspace(0, len(ids) - 1, _MOST_CORNERS).astype(int)
+        if nearest:  # those that moved most, and of the others some that hold the turns
+            order = np.argsort(-moved, kind="stable")
+            least = np.linspace(_NEAR_CORNERS, len(ids) - 1, _MOST_CORNERS - _NEAR_CORNERS).astype(int)
+            some = np.sort(np.concatenate([order[:_NEAR_CORNERS], order[least]]))
+        ids = ids[some]
+    px = np.array([images[k].px[np.searchsorted(images[k].ids, ids)] - middle for k in at])
+    rows = px[..., 1] / (2.0 * middle[1] + 1.0)
+    return Window(px, rows, np.array([images[k].t_s for k in at]))
 
 
 def _undistorted(px: Floats, focal_px: float, k1: float, fisheye: bool) -> Floats:
@@ -138,9 +165,10 @@ def begin(
     sigma_px: float,
     fisheye: bool,
     k1_before: tuple[float, float],
+    readout_before: tuple[float, float] = (0.0, HELD),
 ) -> LensProblem | None:
     """Poses and corners of each window, by its first and last image and by resection of those between."""
-    px, of, corner = [], [], []
+    px, row, t_s, of, corner = [], [], [], [], []
     R: list[Floats] = []
     t: list[Floats] = []
     for window in windows:
@@ -149,6 +177,8 @@ def begin(
             continue
         keep, R_w, t_w, corner_w = begun
         px.append(window.px[:, keep].transpose(1, 0, 2))
+        row.append(window.row[:, keep].T)
+        t_s.append(window.t_s)
         of.append(np.full(int(keep.sum()), len(R)))
         R.append(R_w)
         t.append(t_w)
@@ -157,7 +187,9 @@ def begin(
         return None
     return LensProblem(
         np.concatenate(px),
+        np.concatenate(row),
         np.concatenate(of),
+        np.array(t_s),
         np.array(R),
         np.array(t),
         np.concatenate(corner),
@@ -166,6 +198,8 @@ def begin(
         sigma_px,
         fisheye,
         k1_before,
+        readout_before[0],
+        readout_before,
     )
 
 

@@ -6,16 +6,17 @@ camera's foot.
 
 from __future__ import annotations
 
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from birdslam.geometry.arrays import Floats
-from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.geometry.camera import PLANE_AT_M, Camera, GroundPlane
 
 Numbers = TypeVar("Numbers", float, Floats)
 
 MAX_RANGE_M = 200.0  # beyond it a pixel row covers tens of metres
+_LEAST_SLOPE = 1e-4  # of a ray that meets the road
 
 
 def meet_road(rays: Floats, fall: Floats, height_m: float) -> Floats:
@@ -31,6 +32,44 @@ def meet_road(rays: Floats, fall: Floats, height_m: float) -> Floats:
 def road_slope(depth_m: Numbers, height_m: Numbers | float) -> Numbers:
     """Eq. 1 solved for the slope of the ray to the road `depth_m` ahead; both broadcast."""
     return height_m / depth_m
+
+
+def meet_bend(slope: Floats, height_m: float, vertical_per_m: float) -> Floats:
+    """(N,) how far ahead rays of `slope` (N,) meet a road that rises by `vertical_per_m` x^2 / 2: Eq. 1, bent.
+
+    Slopes are against the plane that touches the road under the camera: vertical_per_m x^2 / 2 + slope x = height_m.
+    What lies beyond a crest is put on the ray that touches it.
+    """
+    if vertical_per_m:
+        slope = 0.5 * (slope + np.sqrt(np.maximum(slope * slope + 2.0 * vertical_per_m * height_m, 0.0)))
+    return meet_road(np.ones_like(slope), np.maximum(slope, _LEAST_SLOPE), height_m)
+
+
+def tilted(
+    x_m: Floats, y_m: Floats, height_m: float, by_rad: Floats | float, vertical_per_m: float = 0.0
+) -> tuple[Floats, Floats]:
+    """Where points of the road lie if the camera's nose is lower by `by_rad` than it was taken to be (Eq. 1).
+
+    And if the road rises by `vertical_per_m` x^2 / 2 over the plane under the camera.
+    """
+    x = meet_bend(road_slope(x_m, height_m) + by_rad, height_m, vertical_per_m)
+    return x, y_m * x / x_m
+
+
+class RoadProfile(NamedTuple):
+    """The road ahead over the plane under the camera: how high that is (m), and its vertical curvature (1/m)."""
+
+    height_m: float
+    vertical_per_m: float = 0.0
+
+    def slope(self, depth_m: Numbers, lower_m: Numbers | float = 0.0) -> Numbers:
+        """Of the ray to the road `depth_m` ahead, `lower_m` under it, against the plane."""
+        return road_slope(depth_m, self.height_m + lower_m) - rise(depth_m, self.vertical_per_m)
+
+
+def rise(depth_m: Numbers, vertical_per_m: float) -> Numbers:
+    """By how much more the ray to the road `depth_m` ahead rises than to its plane (rad), by its vertical curvature."""
+    return 0.5 * vertical_per_m * (depth_m - PLANE_AT_M)
 
 
 def rays_cam(camera: Camera, px: Floats) -> Floats:
@@ -60,9 +99,17 @@ def road_point_cam(camera: Camera, ground: GroundPlane, px: Floats) -> Floats:
     return points
 
 
-def pixel_to_ego(camera: Camera, ground: GroundPlane, px: Floats) -> Floats:
-    """Road points in ego, (N, 2) in metres, of pixels (N, 2); NaN above the horizon or past MAX_RANGE_M."""
-    return (road_point_cam(camera, ground, px) @ ground.R_ego_cam.T)[:, :2]
+def pixel_to_ego(camera: Camera, ground: GroundPlane, px: Floats, vertical_per_m: float = 0.0) -> Floats:
+    """Road points in ego, (N, 2) in metres, of pixels (N, 2); NaN above the horizon or past MAX_RANGE_M.
+
+    `vertical_per_m` is the road's vertical curvature over the ground.
+    """
+    if not vertical_per_m:
+        return (road_point_cam(camera, ground, px) @ ground.R_ego_cam.T)[:, :2]
+    bearing, slope = bearing_and_slope(camera, ground, np.atleast_2d(np.asarray(px, dtype=np.float64))).T
+    x = meet_bend(slope + rise(0.0, vertical_per_m), ground.height_m, vertical_per_m)
+    x[x > MAX_RANGE_M] = np.nan
+    return np.column_stack([x, bearing * x])
 
 
 def ego_to_pixel(camera: Camera, ground: GroundPlane, points: Floats) -> Floats:
@@ -102,23 +149,24 @@ def road_point_errors(
     sigma_px: Floats | float,
     sigma_pitch_rad: float,
     sigma_height_rel: float,
+    vertical_per_m: float = 0.0,
 ) -> Floats:
     """(N, 2, 4) in m: what 1-sigma of the point's column and row, and of all points' pitch and height moves it by."""
     px = np.atleast_2d(np.asarray(px, dtype=np.float64))
     sigma_u, sigma_v = np.broadcast_to(np.asarray(sigma_px, dtype=np.float64), (2,))
     step_px, step_rad = 0.5, 1e-4
     steps_px = np.array([[0.0, 0.0], [step_px, 0.0], [-step_px, 0.0], [0.0, step_px], [0.0, -step_px]])
-    here, right, left, below, above = pixel_to_ego(camera, ground, (px + steps_px[:, None]).reshape(-1, 2)).reshape(
-        5, -1, 2
-    )
+    stepped = (px + steps_px[:, None]).reshape(-1, 2)
+    here, right, left, below, above = pixel_to_ego(camera, ground, stepped, vertical_per_m).reshape(5, -1, 2)
 
-    def tilted(d_rad: float) -> Floats:
-        return pixel_to_ego(camera, GroundPlane(ground.height_m, ground.pitch_rad + d_rad, ground.roll_rad), px)
+    def pitched(d_rad: float) -> Floats:
+        turned = GroundPlane(ground.height_m, ground.pitch_rad + d_rad, ground.roll_rad)
+        return pixel_to_ego(camera, turned, px, vertical_per_m)
 
     columns = [
         (right - left) / (2.0 * step_px) * sigma_u,
         (below - above) / (2.0 * step_px) * sigma_v,
-        (tilted(step_rad) - tilted(-step_rad)) / (2.0 * step_rad) * sigma_pitch_rad,
+        (pitched(step_rad) - pitched(-step_rad)) / (2.0 * step_rad) * sigma_pitch_rad,
         here * sigma_height_rel,
     ]
     out: Floats = np.stack(columns, axis=-1)

@@ -96,6 +96,7 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     distortion: tuple[float, ...] = ()
     tilt_sigma_rad: Positive = 0.015  # 1-sigma of pitch and roll; by default of a bracket mounted by hand
     fisheye: bool = False  # `distortion` is k1, k2, k3, k4 of the equidistant model
+    readout_s: Annotated[float, msgspec.Meta(ge=0.0, le=0.1)] = 0.0  # from the first row to the last; 0: all at once
     # 1-sigma of all lengths as a fraction, where height or focal length are estimates; 0: they were measured
     scale_sigma_rel: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.0
 

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from birdslam.geometry.arrays import Bools, Floats, Ints
+from birdslam.geometry.bev import tilted
 from birdslam.geometry.camera import PLANE_AT_M, VerticalCurvature
 from birdslam.geometry.se2 import SE2
 from birdslam.lanes.curves import across_sigma_m, basis, moved, slope_basis
 from birdslam.lanes.paint import LinePoints
-from birdslam.lanes.road_view import tilted
 
 Ids = Ints
 

@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 
 from birdslam.geometry.arrays import Bools, Floats, Floats32, Ints
-from birdslam.lanes.road_view import LATTICE_M, RoadView, tilted
+from birdslam.geometry.bev import tilted
+from birdslam.lanes.road_view import LATTICE_M, RoadView
 
 SIDE_M = 0.28  # from a line's middle to the asphalt beside it; lines are up to 0.3 m wide
 APART_M = 0.3  # between two ridges

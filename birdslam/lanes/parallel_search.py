@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from birdslam.geometry.arrays import Floats
+from birdslam.geometry.bev import tilted
 from birdslam.lanes.paint import LinePoints
-from birdslam.lanes.road_view import HALF_WIDTH_M, tilted
+from birdslam.lanes.road_view import HALF_WIDTH_M
 
 BIN_M = 0.1
 SEARCHED_M = 35.0  # a pitch or a hill bends lines beyond

@@ -137,18 +137,3 @@ def _pixels(camera: Camera, ground: GroundPlane, x_m: Floats, y_m: Floats) -> tu
     u = camera.fx_px * (right / depth) + camera.cx_px
     v = camera.fy_px * (down / depth) + camera.cy_px
     return u.astype(np.float32), v.astype(np.float32)
-
-
-def tilted(
-    x_m: Floats, y_m: Floats, height_m: float, by_rad: Floats | float, vertical_per_m: float = 0.0
-) -> tuple[Floats, Floats]:
-    """Where points of the road lie if the camera's nose is lower by `by_rad` than it was taken to be (Eq. 1).
-
-    And if the road rises by `vertical_per_m` x^2 / 2 over the plane under the camera: a ray of slope s meets it where
-    vertical_per_m x^2 / 2 + s x = height_m. What lies beyond a crest is put on the ray that touches it.
-    """
-    slope = bev.road_slope(x_m, height_m) + by_rad
-    if vertical_per_m:
-        slope = 0.5 * (slope + np.sqrt(np.maximum(slope * slope + 2.0 * vertical_per_m * height_m, 0.0)))
-    x = bev.meet_road(np.ones_like(slope), np.maximum(slope, 1e-4), height_m)
-    return x, y_m * x / x_m

@@ -35,14 +35,24 @@ def landmark_edges(
     ground: GroundPlane,
     sigma_pitch_rad: float,
     config: StaticMapConfig,
+    vertical_per_m: float = 0.0,
 ) -> tuple[LandmarkEdge, ...]:
-    """CP edges of the nearest feature tracks that lie on the road: `ids` (N,) at pixels `px` (N, 2)."""
-    points = bev.pixel_to_ego(camera, ground, px)  # Eq. 1
+    """CP edges of the nearest feature tracks that lie on the road: `ids` (N,) at pixels `px` (N, 2).
+
+    `vertical_per_m` is the road's vertical curvature.
+    """
+    points = bev.pixel_to_ego(camera, ground, px, vertical_per_m)  # Eq. 1
     with np.errstate(invalid="ignore"):
         near = np.flatnonzero(points[:, 0] < config.landmark_range_m)
     near = near[np.argsort(points[near, 0], kind="stable")][: config.max_landmarks]
     J = bev.road_point_errors(
-        camera, ground, px[near], config.sigma_landmark_px, sigma_pitch_rad, config.sigma_height_rel
+        camera,
+        ground,
+        px[near],
+        config.sigma_landmark_px,
+        sigma_pitch_rad,
+        config.sigma_height_rel,
+        vertical_per_m,
     )
     flat, shared = (J @ np.swapaxes(J, 1, 2)).reshape(-1, 4), J[:, :, 2:].reshape(-1, 4)
     known = np.isfinite(flat).all(axis=1)

@@ -25,6 +25,11 @@ class MotionModel:
         return self._rate is not None
 
     @property
+    def rate(self) -> tuple[Floats, Floats]:
+        """(3,) m/s and (3,) rad/s of the camera in its own axes; zero where none was ever measured."""
+        return (np.zeros(3), np.zeros(3)) if self._rate is None else self._rate
+
+    @property
     def speed_mps(self) -> float:
         """0 where none was ever measured."""
         return 0.0 if self._rate is None else float(np.linalg.norm(self._rate[0]))

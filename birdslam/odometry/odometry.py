@@ -11,12 +11,14 @@ image that it stopped in stays the reference of all later ones.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import Pose
+from birdslam.geometry.rolling_shutter import RollingShutter
 from birdslam.odometry.corners.feature_tracks import FeatureTracker, Tracks, predict_corners_px
 from birdslam.odometry.corners.initialisation import MotionInitialiser
 from birdslam.odometry.corners.keyframes import KeyframeWindow
@@ -68,6 +70,7 @@ class Odometry:
         self.camera = camera = self._resolution.camera
         self.config = config if config is not None else OdometryConfig()
         self._focal_px = 0.5 * (camera.fx_px + camera.fy_px)
+        self._shutter = RollingShutter(camera)
         self._tracker = FeatureTracker(camera.width_px, camera.height_px, self.config.features)
         self._initialiser = MotionInitialiser(camera, RoadAligner(camera, self.config.road.align), self.config.start)
         self.reset()
@@ -132,7 +135,13 @@ class Odometry:
     def _predict_px(self, reference: Tracks) -> Floats:
         step = self._model.predict(self._model.interval_s)
         unknown_px = predict_corners_px(self.camera, self._scale.ground, reference.px, step)
-        return self._window.predict_px(self.camera, self._pose @ step, reference.ids, unknown_px)
+        pose = self._pose @ step
+        px = self._window.predict_px(self.camera, pose, reference.ids, unknown_px)
+        if not self._shutter.readout_s:
+            return px
+        xy = self.camera.to_xy(px)
+        xy = self._shutter.as_read(xy, self._inverse_depths(reference.ids, xy, pose), self._model.rate)
+        return self.camera.to_px(xy)
 
     # --- motion ---
 
@@ -232,7 +241,8 @@ class Odometry:
         self._tracker.accept(tracks)
         self._window, self._pose = KeyframeWindow(self._focal_px, self.config), NO_MOTION
         static = outside(tracks.px, boxes_px, is_night(tracks.image))
-        self._window.append(frame_id, self._pose, tracks.ids[static], self.camera.to_xy(tracks.px[static]))
+        ids, xy = tracks.ids[static], self.camera.to_xy(tracks.px[static])
+        self._window.append(frame_id, self._pose, ids, self._at_middle(ids, xy, self._pose))
         self._reference_frame, self._reference_t_ns, self._reference_seen = frame_id, t_source_ns, True
         self._scale.restart(tracks.image, self._pose, 0.3)
 
@@ -251,8 +261,10 @@ class Odometry:
         cfg, scale = self.config, self._scale
         driven_m = self._model.speed_mps * dt_s if scale.sigma_rel < _KNOWN_SCALE_SIGMA_REL else None
         selected = self._selector.select(tracks, self._tracker.reference, boxes_px, scale.ground, driven_m)
+        predicted = self._pose @ self._model.predict(dt_s)
+        selected = replace(selected, xy=self._at_middle(selected.ids, selected.xy, predicted))
         searched = [] if self._searched is None else [self._pose @ self._searched]
-        guesses = [*searched, self._pose @ self._model.predict(dt_s), self._pose]
+        guesses = [*searched, predicted, self._pose]
         limits = InlierLimits(cfg.min_fitting, cfg.min_fitting_fraction, cfg.max_speed_mps * dt_s + 0.1)
         corners, located = pose_without_fixed_corners(self._window, selected, self._pose, guesses, limits)
         self._obstructed = corners is not selected
@@ -266,6 +278,7 @@ class Odometry:
         if len(a) < cfg.min_fitting:
             return None
         xy_a, xy_b = self.camera.to_xy(reference.px[a]), corners.xy[b]
+        xy_a = self._at_middle(reference.ids[a], xy_a, self._pose)
         if self._seems_still(corners):
             return self._pose, _TWO_VIEW_INFORMATION
         guess = self._searched if self._searched is not None else self._model.predict(dt_s)
@@ -285,6 +298,20 @@ class Odometry:
         self._window.append(frame, self._pose, reference.ids[a], xy_a)
         self._scale.restart(reference.image, self._pose, 0.2 if driven_m > 0.05 else 1.0)
         return self._pose @ Pose(step.R, step.p * length), _TWO_VIEW_INFORMATION
+
+    # --- rolling shutter ---
+
+    def _at_middle(self, ids: Ints, xy: Floats, pose: Pose) -> Floats:
+        """(N, 2) where corners seen at `xy` by a camera at `pose` were when its middle row was read."""
+        if not (self._shutter.readout_s and self._model.known):
+            return xy
+        return self._shutter.at_middle(xy, self._inverse_depths(ids, xy, pose), self._model.rate)
+
+    def _inverse_depths(self, ids: Ints, xy: Floats, pose: Pose) -> Floats:
+        """(N,) of corners in a camera at `pose`: as the window knows them, else as of the road, else far off."""
+        ground = self._scale.ground
+        below = -(np.column_stack([xy, np.ones(len(xy))]) @ ground.normal_cam)
+        return self._window.inverse_depths_of(pose, ids, np.maximum(below, 0.0) / ground.height_m)
 
     # --- metric scale ---
 

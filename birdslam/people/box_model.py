@@ -1,11 +1,11 @@
 """What the box of somebody looks like at depth X, and how its numbers err.
 
-    bearing = Y / X,   bottom = (H + b) / (X - reach) - tilt + foot h / X (Eq. 1),
+    bearing = Y / X,   bottom = (H + b) / (X - reach) - rise - tilt + foot h / X (Eq. 1),
     log of the height = log(h) - log(X) + log(1 + reach (H + b) / ((X - reach) h)) + foot - head,
     log of the width = log(w) - log(X).
 
-H is the camera's height; the road under the feet lies b lower than the ego's plane (kerb); the nearest foot is at
-X - reach; a hidden foot lets the box end `foot` of h / X higher. In logarithms the derivatives stay the same.
+H is the camera's height; the road rises by `rise` (`bev.rise`), less b under the feet (kerb); the nearest foot is at
+X - reach; a hidden one lets the box end `foot` of h / X higher. In logarithms derivatives stay the same.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from birdslam.geometry import bev
 from birdslam.geometry.arrays import Floats
+from birdslam.geometry.bev import RoadProfile
 from birdslam.geometry.se2 import SE2
 from birdslam.people.people_boxes import PersonBox
 from birdslam.people.people_config import PeopleConfig
@@ -44,25 +44,26 @@ def measured_boxes(boxes: Sequence[PersonBox]) -> tuple[Floats, Floats]:
 
 
 def expected_boxes(
-    x: Floats, T_world_ego: SE2, height_m: float, reach_m: Floats, log_width: Floats, config: PeopleConfig
+    x: Floats, T_world_ego: SE2, road: RoadProfile, reach_m: Floats, log_width: Floats, config: PeopleConfig
 ) -> tuple[Floats, Floats]:
     """Measurements (M, K, 2, 4) expected of states (M, K, 2, S), feet visible and hidden, and their Jacobians.
 
-    `height_m` is the camera's over the road; `reach_m` and `log_width` (M,) are of each person.
+    `reach_m` and `log_width` (M,) are of each person.
     """
     R = T_world_ego.rotation()
     in_ego = (x[..., :2] - [T_world_ego.x_m, T_world_ego.y_m]) @ R
     depth, y = np.maximum(in_ego[..., 0], NEAREST_M), in_ego[..., 1]
     foot = np.maximum(depth - reach_m[:, None, None], 0.5 * NEAREST_M)
-    height, below = np.exp(x[..., HEIGHT]), height_m + x[..., KERB]
+    height, below = np.exp(x[..., HEIGHT]), road.height_m + x[..., KERB]
     expected, J = np.empty((*x.shape[:3], 4)), np.zeros((*x.shape[:3], 4, len(STATES)))
     expected[..., BEARING] = y / depth
     tall = height / depth
-    expected[..., BOTTOM] = bev.road_slope(foot, below) - x[..., TILT] + x[..., FOOT] * tall  # Eq. 1
+    expected[..., BOTTOM] = road.slope(foot, x[..., KERB]) - x[..., TILT] + x[..., FOOT] * tall  # Eq. 1
     nearer = (depth - foot) * below / (foot * height)  # how much taller a nearer foot makes it
     expected[..., TALL] = x[..., HEIGHT] - np.log(depth) + np.log1p(nearer) + x[..., FOOT] - x[..., HEAD]
     expected[..., WIDTH] = log_width[:, None, None] - np.log(depth)
-    by_depth = np.stack([-y / depth**2, -below / foot**2, -(1.0 + nearer) / depth, -1.0 / depth], axis=-1)
+    falls = -below / foot**2 - 0.5 * road.vertical_per_m
+    by_depth = np.stack([-y / depth**2, falls, -(1.0 + nearer) / depth, -1.0 / depth], axis=-1)
     J[..., :2] = by_depth[..., None] * R[:, 0]
     J[..., BEARING, :2] += R[:, 1] / depth[..., None]
     J[..., BOTTOM, TILT], J[..., BOTTOM, KERB], J[..., BOTTOM, FOOT] = -1.0, 1.0 / foot, tall

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from birdslam.geometry import bev
 from birdslam.geometry.arrays import Bools, Floats
+from birdslam.geometry.bev import RoadProfile
 from birdslam.geometry.se2 import SE2
 from birdslam.people.box_model import MIN_SLOPE, TALL, UNUSED, WIDTH, expected_boxes, hide_feet, measured_boxes
 from birdslam.people.people_boxes import PersonBox
@@ -124,7 +125,7 @@ class PeopleFilter:
             J[..., 0, 2], J[..., 1, 2] = -from_ego[..., 1], from_ego[..., 0]
             self._P[..., :2, :2] += J @ ego_cov @ J.swapaxes(-1, -2)
 
-    def begin(self, boxes: Sequence[PersonBox], T_world_ego: SE2, height_m: float) -> None:
+    def begin(self, boxes: Sequence[PersonBox], T_world_ego: SE2, road: RoadProfile) -> None:
         """People seen for the first time, each in a row after the others, already corrected by their boxes."""
         if not boxes:
             return
@@ -167,28 +168,28 @@ class PeopleFilter:
         self._log_height = np.concatenate([self._log_height, log_height])
         self._own_var = np.concatenate([self._own_var, own_var])
         self._unseen_s = np.concatenate([self._unseen_s, np.full(n, max(config.box_memory_s, config.width_memory_s))])
-        self.correct(range(before, before + n), boxes, T_world_ego, height_m, BIRTH_ITERATIONS)
+        self.correct(range(before, before + n), boxes, T_world_ego, road, BIRTH_ITERATIONS)
 
     def correct(
         self,
         rows: Sequence[int],
         boxes: Sequence[PersonBox],
         T_world_ego: SE2,
-        height_m: float,
+        road: RoadProfile,
         iterations: int = ITERATIONS,
     ) -> None:
-        """The people in `rows` by their boxes, one each; `height_m` is the camera's over the road."""
+        """The people in `rows` by their boxes, one each."""
         if not boxes:
             return
         at = np.asarray(rows)
-        self.road.tell(rows, boxes, height_m)
+        self.road.tell(rows, boxes, road)
         z, R = self._measured(at, boxes)  # (M, 4), (M, 4, 4)
         counts = np.minimum(1.0, self._unseen_s[at] / self.config.box_memory_s)[:, None, None]  # as so many boxes
         hidden = np.array([box.hidden for box in boxes])
         x0, P0 = self._x[at][:, :, None], self._P[at][:, :, None]  # (M, K, 1, 9)
         x = np.repeat(x0, 2, axis=2)
         for _ in range(iterations):
-            expected, J = expected_boxes(x, T_world_ego, height_m, self._sizes[at, 0], self._sizes[at, 2], self.config)
+            expected, J = expected_boxes(x, T_world_ego, road, self._sizes[at, 0], self._sizes[at, 2], self.config)
             noise = np.broadcast_to(R[:, None, None], (*x.shape[:3], 4, 4)).copy()
             hide_feet(noise[:, :, 1], np.exp(expected[:, :, 0, TALL]), self.config)
             PJt = P0 @ J.swapaxes(-1, -2)
@@ -263,14 +264,14 @@ class PeopleFilter:
             self._P = self._P - change[..., None, None] * gain[..., :, None] * Pa[..., None, :]
         self._shared = shared
 
-    def distances(self, boxes: Sequence[PersonBox], T_world_ego: SE2, height_m: float) -> tuple[Floats, Floats]:
+    def distances(self, boxes: Sequence[PersonBox], T_world_ego: SE2, road: RoadProfile) -> tuple[Floats, Floats]:
         """(N, M) squared Mahalanobis distances of boxes from everybody, and -2 log of their likelihoods.
 
         Each is the better one of feet visible and hidden.
         """
         n = len(self._x)
         x = np.repeat(self._x[:, :, None], 2, axis=2)
-        expected, J = expected_boxes(x, T_world_ego, height_m, self._sizes[:, 0], self._sizes[:, 2], self.config)
+        expected, J = expected_boxes(x, T_world_ego, road, self._sizes[:, 0], self._sizes[:, 2], self.config)
         expected, J = expected[..., :WIDTH], J[..., :WIDTH, :]
         S = J @ self._P[:, :, None] @ J.swapaxes(-1, -2)
         mean, S = merged(expected.swapaxes(1, 2), S.swapaxes(1, 2), self._weight[:, None])  # (N, 2, 3), (N, 2, 3, 3)

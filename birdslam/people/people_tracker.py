@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 
 from birdslam.geometry.arrays import Floats
+from birdslam.geometry.bev import RoadProfile
 from birdslam.geometry.camera import Camera
 from birdslam.people.box_model import MIN_SLOPE
 from birdslam.people.people_boxes import BICYCLE, CYCLIST, PEDESTRIAN, PeopleBoxesConfig, PersonBox, people_boxes
@@ -85,7 +86,7 @@ class PersonTrack:
 class PeopleTracker:
     """settle() once for each frame, in order, with its detections or without any.
 
-    What it knows of the road is the front end's ground in that frame.
+    What it knows of the road is the front end's ground in that frame, and its vertical curvature.
     """
 
     def __init__(self, camera: Camera, config: PeopleTrackingConfig) -> None:
@@ -103,20 +104,21 @@ class PeopleTracker:
     def settle(self, frame: OpenFrame, detections: Detections | None, road: GroundSizeFilter) -> None:
         """The next frame. None for `detections`: no detector looked at it. `road` is the ground in it."""
         ego, ground = frame.ego, road.ground
+        profile = RoadProfile(ground.height_m, road.vertical_per_m)
         self._predict(frame, road)
         self.frame = frame
         if detections is not None:
             boxes = people_boxes(detections, self.camera, ground, self.config.boxes)
-            pairs = self._associate(boxes, frame, ground.height_m)
+            pairs = self._associate(boxes, frame, profile)
             rows = [row for row, _ in pairs]
-            self.filter.correct(rows, [boxes[k] for _, k in pairs], ego.T_world_ego, ground.height_m)
+            self.filter.correct(rows, [boxes[k] for _, k in pairs], ego.T_world_ego, profile)
             for row, k in pairs:
                 track = self.tracks[row]
                 track.box, track.seen_ns, track.seen_frame = boxes[k], ego.t_source_ns, ego.frame_id
                 track.hits += 1
                 track.votes[boxes[k].label] += 1
             self.filter.share()
-            self._begin(boxes, {k for _, k in pairs}, frame, ground.height_m)
+            self._begin(boxes, {k for _, k in pairs}, frame, profile)
         self._conclude(frame)
 
     def _predict(self, frame: OpenFrame, road: GroundSizeFilter) -> None:
@@ -126,11 +128,11 @@ class PeopleTracker:
         ego_mps = UNKNOWN_MPS if frame.travelled_m is None else frame.travelled_m / max(frame.dt_s, 1e-3)
         self.filter.predict(frame.dt_s, ego.T_world_ego, ego.step_cov, shift_rad, ego_mps, road.sigma_pitch_rad)
 
-    def _associate(self, boxes: Sequence[PersonBox], frame: OpenFrame, height_m: float) -> list[tuple[int, int]]:
+    def _associate(self, boxes: Sequence[PersonBox], frame: OpenFrame, road: RoadProfile) -> list[tuple[int, int]]:
         """(row, box): the assignment of least total cost, -2 log of the likelihood within the gate."""
         if not boxes or not self.tracks:
             return []
-        squared, costs = self.filter.distances(boxes, frame.ego.T_world_ego, height_m)
+        squared, costs = self.filter.distances(boxes, frame.ego.T_world_ego, road)
         t_ns = frame.ego.t_source_ns
         since_s = max((t_ns - max(track.seen_ns for track in self.tracks)) * 1e-9, MIN_DT_S)  # anybody had a box
         costs += self._sight(since_s) + self._classes(boxes) + self._shapes(boxes, t_ns)
@@ -173,7 +175,7 @@ class PeopleTracker:
         same = np.equal.outer([box.label for box in before], [box.label for box in boxes])
         return np.where(same, cost, 0.0)
 
-    def _begin(self, boxes: list[PersonBox], matched: set[int], frame: OpenFrame, height_m: float) -> None:
+    def _begin(self, boxes: list[PersonBox], matched: set[int], frame: OpenFrame, road: RoadProfile) -> None:
         followed = np.array([boxes[k].box_px for k in matched]).reshape(-1, 4)
         births: list[int] = []
         for k, box in enumerate(boxes):
@@ -183,7 +185,7 @@ class PeopleTracker:
                 continue
             births.append(k)
         ego = frame.ego
-        self.filter.begin([boxes[k] for k in births], ego.T_world_ego, height_m)
+        self.filter.begin([boxes[k] for k in births], ego.T_world_ego, road)
         self.tracks += [
             PersonTrack(boxes[k], ego.t_source_ns, ego.frame_id, votes=Counter({boxes[k].label: 1})) for k in births
         ]  # fmt: skip

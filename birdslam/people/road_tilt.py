@@ -14,8 +14,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from birdslam.geometry import bev
 from birdslam.geometry.arrays import Floats
+from birdslam.geometry.bev import RoadProfile
 from birdslam.people.box_model import MIN_SLOPE, NEAREST_M
 from birdslam.people.people_boxes import PersonBox
 from birdslam.people.people_config import PeopleConfig
@@ -25,7 +25,7 @@ _T, _D, _TILT = range(3)  # of a sample
 _SHARED = slice(_T, _D + 1)
 
 
-def samples_of(boxes: Sequence[PersonBox], height_m: float, config: PeopleConfig) -> Floats:
+def samples_of(boxes: Sequence[PersonBox], road: RoadProfile, config: PeopleConfig) -> Floats:
     """(N, 3, 3): of each box w a a', with a = (1, H / depth, t) and w the information of t; nothing of hidden feet."""
     out = np.zeros((len(boxes), 3, 3))
     for k, box in enumerate(boxes):
@@ -33,8 +33,8 @@ def samples_of(boxes: Sequence[PersonBox], height_m: float, config: PeopleConfig
             continue
         sizes = config.sizes(box.label)
         depth = sizes.height_m / box.tan_height
-        tilt = bev.road_slope(max(depth - sizes.reach_m, NEAREST_M), height_m + config.kerb_m) - box.slope_bottom
-        slope = height_m / depth
+        tilt = road.slope(max(depth - sizes.reach_m, NEAREST_M), config.kerb_m) - box.slope_bottom
+        slope = road.height_m / depth
         of_size = config.own_height_var(sizes.sigma_height_rel) + (2.0 * config.sigma_outline_rel) ** 2
         variance = slope**2 * of_size + (config.sigma_kerb_m / depth) ** 2
         variance += config.sigma_tilt_rad**2 + (config.sigma_roll_rad * box.bearing) ** 2
@@ -82,9 +82,9 @@ class SharedRoad:
         M[_TILT, _T] = -shift_rad
         self._told, self._boxes = keep * (M @ self._told @ M.T), keep * self._boxes
 
-    def tell(self, rows: Sequence[int], boxes: Sequence[PersonBox], height_m: float) -> None:
-        """The boxes of the people in `rows`, one each; `height_m` is the camera's over the road."""
-        at, samples = np.asarray(rows), samples_of(boxes, height_m, self.config)
+    def tell(self, rows: Sequence[int], boxes: Sequence[PersonBox], road: RoadProfile) -> None:
+        """The boxes of the people in `rows`, one each."""
+        at, samples = np.asarray(rows), samples_of(boxes, road, self.config)
         self._told[at] += samples
         self._boxes[at] += samples[:, 0, 0] > 0.0
 

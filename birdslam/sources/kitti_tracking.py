@@ -27,7 +27,10 @@ from birdslam.sources.recording import DatasetError
 from birdslam.trajectory import Transform, as_poses, inverse, read_kitti
 
 COLOUR_CAMERAS = (2, 3)  # left, right
-IMAGE_SIZE_PX = (1242, 375)  # of those where there is no image to ask
+IMAGE_SIZE_PX = (1242, 375)  # of the most, where there is no image to ask
+# Of other days of KITTI's recordings, each rectified by its own focal length: -> width and height
+SIZES_BY_FOCAL_PX = {707.0493: (1224, 370), 718.3351: (1238, 374), 718.856: (1241, 376), 707.0912: (1226, 370)}
+SAME_FOCAL_PX = 0.01
 EARTH_RADIUS_M = 6378137.0
 DETECTED_LABELS = {"Car": "car", "Pedestrian": "person"}  # a detector's folder -> label
 VEHICLE_KINDS = ("Car", "Van", "Truck")  # of the labels
@@ -103,7 +106,7 @@ def open_tracking(root: Path, name: str, number: int | None = None) -> TrackingS
     if labels and labels[-1].frame >= len(poses):
         raise DatasetError(f"{root}: sequence {name} has {len(poses)} poses, but labels go on to {labels[-1].frame}")
     images: Path | None = root / f"image_{number:02d}" / name
-    width_px, height_px = IMAGE_SIZE_PX
+    width_px, height_px = _size_px(float(P[0, 0]))
     if images is not None and images.is_dir():
         first = next(iter(find_images(images).values()))
         try:
@@ -119,6 +122,12 @@ def open_tracking(root: Path, name: str, number: int | None = None) -> TrackingS
     if number != COLOUR_CAMERAS[0]:
         labels = project_labels(labels, camera, T_cam0_camera)
     return TrackingSequence(name, camera, T_cam0_camera, poses, tuple(labels), images, number)
+
+
+def _size_px(fx_px: float) -> tuple[int, int]:
+    """Width and height of the images of a day, by its focal length: without them boxes' edges there look uncut."""
+    days = (size for focal_px, size in SIZES_BY_FOCAL_PX.items() if abs(focal_px - fx_px) < SAME_FOCAL_PX)
+    return next(days, IMAGE_SIZE_PX)
 
 
 def _read_poses(root: Path, name: str, calibration: Path) -> Transform:

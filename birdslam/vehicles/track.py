@@ -115,8 +115,16 @@ class Track:
 
     @property
     def label(self) -> str:
-        return max(sorted(self.votes), key=self.votes.__getitem__)
+        return _most_voted(self.votes)
+
+    def label_with(self, label: str) -> str:
+        """What it is called most often, with one more vote."""
+        return self.label if label == self.label else _most_voted(self.votes + Counter((label,)))
 
     def pose(self) -> SE2:
         """T_world_vehicle in the odometry's world."""
         return SE2(float(self.state[0]), float(self.state[1]), self.yaw_rad)
+
+
+def _most_voted(votes: Counter[str]) -> str:
+    return max(sorted(votes), key=votes.__getitem__)

@@ -7,9 +7,11 @@ the CV and VV edges.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,6 +26,7 @@ from birdslam.vehicles.placement.localisation import (
     LocalisationConfig,
     Observation,
     Place,
+    extent_m,
     iou,
     observe_boxes,
 )
@@ -129,6 +132,7 @@ class Tracker:
         for known in self.tracks:
             known.missed += observations is not None
         assignments = self._assignments(frame, observations or [], by_depth)
+        self._reclassify(assignments, frame.T_world_ego)
         places = self.placing.locate(assignments, frame.T_world_ego)
         self._correct(assignments, places, frame)
         for assignment, where in zip(assignments, places, strict=True):
@@ -163,7 +167,31 @@ class Tracker:
         births = [k for k, o in enumerate(observations) if k not in matched and o.score >= self.config.birth_score]
         tracks: list[Track | None] = [*self.tracks, *(None for _ in births)]
         pairs = [*known, *enumerate(births, len(self.tracks))]
-        return [Assignment(row, tracks[row], observations[k], by_depth[k] if by_depth else None) for row, k in pairs]
+        return [
+            Assignment(
+                row, tracks[row], self._as_voted(tracks[row], observations[k]), by_depth[k] if by_depth else None
+            )
+            for row, k in pairs
+        ]
+
+    def _as_voted(self, track: Track | None, seen: Observation) -> Observation:
+        """The observation with the measures of the class that its track is called most often.
+
+        What the filters have learned of it are factors of these: a car is no truck because one box is called so.
+        """
+        label = seen.label if track is None else track.label_with(seen.label)
+        if label == seen.label:
+            return seen
+        return msgspec.structs.replace(seen, dimensions=self.localisation.vehicles[label])
+
+    def _reclassify(self, assignments: Sequence[Assignment], T_world_ego: SE2) -> None:
+        """The tracks that from these boxes on are called something else more often."""
+        for a in assignments:
+            if a.track is not None and (label := a.track.label_with(a.observation.label)) != a.track.label:
+                of_class, yaw_rad = self.localisation.vehicles, a.yaw_rad(T_world_ego, self.config.heading)
+                depth_m, bearing = a.expected_depth_m(T_world_ego), a.observation.bearing
+                now, before = (extent_m(of_class[k], yaw_rad, depth_m, bearing)[1] for k in (label, a.track.label))
+                self.ground_size.reclassify(a.row, of_class[label], math.log(now / before))
 
     def _associate(self, T_world_ego: SE2, observations: list[Observation]) -> list[tuple[int, int]]:
         """(row of a track, its observation): the most overlap of predicted and seen boxes, within the gates."""

@@ -72,6 +72,7 @@ class Dashcam:
             roll_rad=self.roll_rad,
             distortion=distortion if self.fisheye or self.k1 else (),
             fisheye=self.fisheye,
+            readout_s=self.readout_s,
         )
 
 

@@ -22,7 +22,8 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from birdslam.calibration.lens import self_calibrate
-from birdslam.calibration.lens_windows import CornersOfImage, followed_corners
+from birdslam.calibration.lens_windows import followed_corners
+from birdslam.calibration.readout import readout_of_drive
 from birdslam.calibration.uprights import UPRIGHT_IMAGES, lens_by_uprights, upright_edges
 from birdslam.geometry.camera import Camera, Undistorter
 from birdslam.odometry.odometry import Odometry
@@ -38,7 +39,7 @@ from birdslam.sources.camera_file import load_camera
 from birdslam.sources.opening import open_recording
 from birdslam.sources.recording import DatasetError, Recording
 from birdslam.trajectory import as_poses
-from birdslam.types import Frame
+from birdslam.types import NS_PER_S, Frame
 
 label = "a lens from the drive alone: errors and own sigmas of focal length and distortion"
 
@@ -55,6 +56,7 @@ class Recorded:
 
     uri: str
     chessboard: str | None = None
+    global_shutter: bool = True
 
 
 RECORDED = {
@@ -64,7 +66,7 @@ RECORDED = {
     "0005": Recorded("kitti:{data}/kitti_tracking/training/image_03/0005"),
     "0002": Recorded("kitti:{data}/kitti_tracking/training/image_02/0002"),
     "two_passes": Recorded("kitti:{data}/two_passes/left"),
-    "motorway": Recorded("video:{data}/highway/solidWhiteRight.mp4", "highway/camera_cal"),
+    "motorway": Recorded("video:{data}/highway/solidWhiteRight.mp4", "highway/camera_cal", global_shutter=False),
 }
 
 
@@ -120,7 +122,18 @@ def render(directory: Path, names: list[str], images: int) -> None:
         write_film(directory / f"{name}.mp4", shown(name, poses), RENDERED_HZ, RENDERED_CRF)
         np.savez_compressed(directory / f"{name}.npz", T_world_cam=np.array(poses))
         camera = DASHCAMS[name].camera
-        keys = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px", "height_m", "distortion", "fisheye")
+        keys = (
+            "width_px",
+            "height_px",
+            "fx_px",
+            "fy_px",
+            "cx_px",
+            "cy_px",
+            "height_m",
+            "distortion",
+            "fisheye",
+            "readout_s",
+        )
         lines = [f"{key} = {getattr(camera, key)!r}".replace("False", "false").replace("True", "true") for key in keys]
         text = "\n".join(lines).replace("(", "[").replace(")", "]") + "\n"
         (directory / f"{name}.toml").write_text(text, encoding="utf-8")
@@ -136,18 +149,20 @@ class Drive:
 
     recording: Recording
     T_world_cam: NDArray[np.float64] | None
+    readout_s: float | None  # None: nobody knows it
 
 
 def _rendered(path: Path) -> Drive:
     with np.load(path.with_suffix(".npz")) as kept:
         poses = kept["T_world_cam"]
-    return Drive(open_recording(f"video:{path}", load_camera(path.with_suffix(".toml"))), poses)
+    recording = open_recording(f"video:{path}", load_camera(path.with_suffix(".toml")))
+    return Drive(recording, poses, recording.camera.readout_s)
 
 
 def _recorded(drive: Recorded, data: Path) -> Drive:
     recording = _open(drive, data)
     rows = recording.truth_poses()
-    return Drive(recording, None if rows is None else as_poses(rows))
+    return Drive(recording, None if rows is None else as_poses(rows), 0.0 if drive.global_shutter else None)
 
 
 def _open(drive: Recorded, data: Path) -> Recording:
@@ -178,7 +193,8 @@ def rows_of(drive: Drive, configuration: Configuration | None) -> Iterator[dict[
     true_k1 = camera.distortion[0] if camera.distortion and not camera.fisheye else 0.0
     images = [frame.image for frame in recording.frames() if frame.image is not None]
     boxes = _boxes(recording, configuration, images)
-    corners = [CornersOfImage(each.ids, each.px) for each in followed_corners(zip(images, boxes, strict=True), camera)]
+    times_s = [frame.t_source_ns / NS_PER_S for frame in recording.frames() if frame.image is not None]
+    corners = followed_corners(zip(images, boxes, times_s, strict=True), camera)
     uprights = lens_by_uprights([upright_edges(image) for image in images[:: max(1, len(images) // UPRIGHT_IMAGES)]])
     bend = None if uprights is None else (uprights.bend, uprights.bend_sigma)
     by_lines = {
@@ -186,11 +202,18 @@ def rows_of(drive: Drive, configuration: Configuration | None) -> Iterator[dict[
         "bend": None if bend is None else bend[0],
         "bend_sigma": None if bend is None else bend[1],
     }
+    readout = readout_of_drive(corners, camera)
+    by_rows = {
+        "true_readout_s": drive.readout_s,
+        "readout_by_drive": readout.by_drive,
+        "readout_s": readout.readout_s,
+        "readout_sigma_s": readout.sigma_s,
+    }
     some = images[: max(2, round(METRES_S * recording.rate_hz))]
     true_way_m, over_truth = way_m(camera, some, recording.rate_hz, drive.T_world_cam)
     for prior in PRIORS:
         lens = self_calibrate(corners, (camera.width_px, camera.height_px), prior * true_px, PRIOR_SIGMA, bend=bend)
-        same = {"prior": prior, "images": len(images), "true_px": true_px, "true_k1": true_k1, **by_lines}
+        same = {"prior": prior, "images": len(images), "true_px": true_px, "true_k1": true_k1, **by_lines, **by_rows}
         if lens is None:
             yield {**same, "focal_shown": None}
             continue
@@ -258,12 +281,20 @@ def row_text(row: dict[str, Any]) -> str:
         f"turned {row['turned_deg']:.0f} deg, f {row['focal_error']:+.1%} +- {row['focal_sigma']:.1%} "
         f"{'' if row['focal_shown'] else '(kept) '} k1 {row['k1']:+.3f} +- {row['k1_sigma']:.3f} (true "
         f"{row['true_k1']:+.3f}; bend by lines {_bend(row)}, true {row['true_bend']:+.2f}), way {way}, "
-        f"by the true lens {_off(row['way_by_true_lens'])} of the truth"
+        f"by the true lens {_off(row['way_by_true_lens'])} of the truth; "
+        f"rows by the drive {_ms(row['readout_by_drive'])} ms (true {_ms(row['true_readout_s'])})"
     )
 
 
 def _bend(row: dict[str, Any]) -> str:
     return "-" if row["bend"] is None else f"{row['bend']:+.2f} +- {row['bend_sigma']:.2f}"
+
+
+def _ms(readout: tuple[float, float] | float | None) -> str:
+    """A time, with its 1-sigma where there is one, in ms."""
+    if readout is None:
+        return "-"
+    return f"{1e3 * readout:.0f}" if isinstance(readout, float) else f"{1e3 * readout[0]:.0f} +- {1e3 * readout[1]:.0f}"
 
 
 def _off(ratio: float | None) -> str:
@@ -280,23 +311,26 @@ def table(rows: list[dict[str, Any]]) -> str:
         f"lens does to the metres of the first {METRES_S:g} s, at the same height. Recorded drives come first, then",
         "rendered dashcams (`birdslam/world/dashcam.py`), whose films lie in tests/dashcams.",
         "",
-        "The last column is the odometry by the true lens against the true way. Rows that are read in turn make it",
-        "long (`phone`: 30 ms), and nothing in a film tells how long its camera takes. So a film's stated sigma has",
-        "17 ms of it in (runtime/calibration/height.py), the more the faster it drives.",
+        "*True lens* is the odometry by the true lens and readout against the true way.",
+        "*Readout* is the time from an image's first row to its last, in ms: by the drive alone and the true lens",
+        "(birdslam/calibration/readout.py); what a camera file gets of it, where 15 +- 9 ms are usual; the truth.",
+        "KITTI's cameras read all rows at once.",
         "",
         "*Bend* is k1 over the square of the focal length in image widths: what lines that are upright in the world",
         "say of it (birdslam/calibration/uprights.py), which the bundle adjustment takes as known beforehand.",
         "",
         "| drive | prior | turn, deg | focal length off by | sigma | | bend by lines | true bend | k1 | sigma "
-        "| true k1 | way | true lens |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
+        "| true k1 | way | true lens | readout by the drive | with what is usual | true |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
         head = f"| {row['drive']} | {row['prior'] - 1.0:+.0%} |"
         if row["focal_shown"] is None:
-            out.append(f"{head} | | | too little to see | | | | | {row['true_k1']:+.3f} | | |")
+            out.append(f"{head} | | | too little to see | | | | | {row['true_k1']:+.3f} | | | | | |")
             continue
         way = f"{_off(row['way_over_true'])} | {_off(row['way_by_true_lens'])}"
+        both = _ms((row["readout_s"], row["readout_sigma_s"]))
+        way += f" | {_ms(row['readout_by_drive'])} | {both} | {_ms(row['true_readout_s'])}"
         out.append(
             f"{head} {row['turned_deg']:.0f} | {row['focal_error']:+.1%} | {row['focal_sigma']:.1%} | "
             f"{'shown' if row['focal_shown'] else 'kept'} | {_bend(row)} | {row['true_bend']:+.2f} | "

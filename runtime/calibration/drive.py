@@ -11,14 +11,22 @@ import msgspec
 
 from birdslam.calibration.calibration import Calibration, CalibrationConfig, CalibrationError, calibrate
 from birdslam.calibration.intrinsics import Intrinsics
+from birdslam.calibration.lens_windows import CornersOfImage
+from birdslam.calibration.readout import Readout, readout_of_drive
 from birdslam.calibration.travel import TravelPitch
 from birdslam.frontend import Pending
 from birdslam.geometry.camera import Camera
 from birdslam.outputs.plain_words import LengthsBy
 from birdslam.ros.bag import BagTopics
 from birdslam.runtime.calibration.given import Given, frame_size, lens_of
-from birdslam.runtime.calibration.height import UNKNOWN_HEIGHT_M, known_lengths, lengths_by, with_height
-from birdslam.runtime.calibration.lens import lens_of_drive
+from birdslam.runtime.calibration.height import (
+    UNKNOWN_HEIGHT_M,
+    focal_sigma_rel,
+    known_lengths,
+    lengths_by,
+    with_height,
+)
+from birdslam.runtime.calibration.lens import corners_of_drive, lens_of_drive
 from birdslam.runtime.calibration.report import report
 from birdslam.runtime.configuration import Configuration
 from birdslam.runtime.nodes.inference import Inference
@@ -60,13 +68,21 @@ def calibrate_drive(
     size = frame_size(uri, topics)
     is_film = parsed(uri)[0].camera in ("frame size", "nothing")
     pitch: TravelPitch | None = None
+    corners: list[CornersOfImage] | None = None
+    k1_sigma = 0.0
     if lens is None and size is not None and is_film:
-        lens, pitch = lens_of_drive(configuration, uri, given, size, stride, must_show)
+        lens, corners, k1_sigma, pitch = lens_of_drive(configuration, uri, given, size, stride, must_show)
     if lens is not None and size is not None:
         lens = lens.for_size(*size)
     recording = _open(uri, lens, height_m, stride, topics)
     if pitch is not None:
         recording.camera = msgspec.structs.replace(recording.camera, pitch_rad=pitch.pitch_rad)
+    readout: Readout | None = None
+    # The rows of a sensor are columns of the film that a phone took upright
+    if is_film and recording.camera.width_px >= recording.camera.height_px:
+        corners = corners or corners_of_drive(configuration, uri, recording.camera, stride)
+        readout = readout_of_drive(corners, recording.camera, focal_sigma_rel(lens), k1_sigma)
+        recording.camera = msgspec.structs.replace(recording.camera, readout_s=readout.readout_s)
     known_height = height_m is not None or lens is None  # a recording with a calibration of its own says the height
     cv2.setNumThreads(configuration.perceive.opencv_threads)
     configuration = configuration.as_lossless()
@@ -86,9 +102,11 @@ def calibrate_drive(
             if must_show:
                 raise CalibrationError(f"{uri}: {error}") from None
             found = _assumed(recording.camera, pitch, str(error))
-    camera, height_by = with_height(found, known_height, lens, uri, is_film)
+    camera, height_by = with_height(found, known_height, lens, uri, readout)
     return Calibrated(
-        camera, [*report(found, camera, height_by, uri, lens)], lengths_by(camera, height_by, lens, given.fov_deg)
+        camera,
+        [*report(found, camera, height_by, uri, lens, readout)],
+        lengths_by(camera, height_by, lens, given.fov_deg),
     )
 
 

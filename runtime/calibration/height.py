@@ -12,6 +12,7 @@ import numpy as np
 from birdslam.calibration.calibration import Calibration, CalibrationError
 from birdslam.calibration.height_check import VEHICLES, HeightCheck, KnownLength
 from birdslam.calibration.intrinsics import Intrinsics
+from birdslam.calibration.readout import Readout
 from birdslam.geometry.camera import Camera
 from birdslam.outputs.plain_words import LengthsBy
 from birdslam.sources.recording import Recording, check_times
@@ -25,8 +26,6 @@ COUNTRY_SIGMA_REL = 0.08
 # Where nothing shows the height: behind a car's windscreen, 1.1 to 1.6 m; by judgement
 WINDSCREEN_M, WINDSCREEN_SIGMA_REL = 1.35, 0.2
 AGREES_SIGMA = 2.0
-# Readouts of 0 to 30 ms are usual, and no film tells its own; root mean square of an even spread
-_READOUT_SIGMA_S = 0.017
 _SHUTTER_PER_M2 = 0.066  # by rendered films of one street, with 0, 15 and 30 ms (docs/constants.md)
 
 
@@ -66,11 +65,12 @@ class HeightBy(NamedTuple):
 
 
 def with_height(
-    found: Calibration, known: bool, lens: Intrinsics | None, uri: str, is_film: bool = False
+    found: Calibration, known: bool, lens: Intrinsics | None, uri: str, readout: Readout | None = None
 ) -> tuple[Camera, HeightBy]:
     """The camera with the height that was stated, else with the surest that was estimated.
 
-    A stated height (and focal length) that something else contradicts is kept, but its sigma covers both.
+    A stated height (and focal length) that something else contradicts is kept, but its sigma covers both. `readout` of
+    the camera's rows is of films, and in the found camera.
     """
     focal_rel = focal_sigma_rel(lens)
     if known:
@@ -78,8 +78,9 @@ def with_height(
     else:
         height_m, by = _estimated_height(found, focal_rel)
     held_together = by.check is not None and by.check.cue != VEHICLES  # by a known length, the shutter's share too
-    if is_film and not held_together:
-        by = by._replace(shutter_rel=shutter_rel(found.camera, height_m, found.speed_mps))
+    if readout is not None and not held_together:
+        rel = shutter_rel(found.camera, height_m, found.speed_mps, readout.sigma_s)
+        by = by._replace(shutter_rel=rel)
     sigma_rel = min(math.hypot(by.sigma_rel, by.shutter_rel), 1.0)
     try:
         return msgspec.structs.replace(found.camera, height_m=height_m, scale_sigma_rel=sigma_rel), by
@@ -87,13 +88,13 @@ def with_height(
         raise CalibrationError(f"{uri}: height {by.words}: {error}") from None
 
 
-def shutter_rel(camera: Camera, height_m: float, speed_mps: float) -> float:
-    """1-sigma of lengths along the road, as a fraction, by a rolling shutter whose readout time no film states.
+def shutter_rel(camera: Camera, height_m: float, speed_mps: float, sigma_s: float) -> float:
+    """1-sigma of lengths along the road, as a fraction, by a rolling shutter whose readout is known to `sigma_s`.
 
     Near road is read later in an image than far road, and moves down meanwhile: its motion is seen over a longer time
     than that between two images. A point of the road at depth z moves by f h V / z^2 rows a second.
     """
-    return _SHUTTER_PER_M2 * _READOUT_SIGMA_S * speed_mps * height_m * camera.fy_px / camera.height_px
+    return _SHUTTER_PER_M2 * sigma_s * speed_mps * height_m * camera.fy_px / camera.height_px
 
 
 def _sigma_rel(check: HeightCheck) -> float:

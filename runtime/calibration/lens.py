@@ -6,14 +6,15 @@ from collections.abc import Iterator
 from itertools import islice
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.calibration.calibration import CalibrationError
 from birdslam.calibration.intrinsics import Intrinsics
 from birdslam.calibration.lens import WIDE_SIGMA_REL, k1_by_bend, self_calibrate
-from birdslam.calibration.lens_adjustment import IMAGES
-from birdslam.calibration.lens_windows import followed_corners
+from birdslam.calibration.lens_adjustment import IMAGES, SIGMA_K1
+from birdslam.calibration.lens_windows import CornersOfImage, followed_corners
 from birdslam.calibration.travel import TravelPitch
 from birdslam.calibration.uprights import UPRIGHT_IMAGES, LensByUprights, lens_by_uprights, upright_edges
 from birdslam.geometry.arrays import Floats
@@ -24,14 +25,17 @@ from birdslam.runtime.configuration import Configuration, complete
 from birdslam.runtime.nodes.inference import Inference
 from birdslam.runtime.nodes.sources import RecordedSource, offline_frames, open_recorded
 from birdslam.runtime.progress import with_progress
+from birdslam.types import NS_PER_S
 
 _LENS_S = 120.0  # of a film, from which its lens is found
 
 
 class LensOfDrive(NamedTuple):
-    """A lens, and the camera's pitch by the way it travels, where its corners show it."""
+    """A lens, the corners that it is from, 1-sigma of its k1, and the pitch by the way driven, where they show it."""
 
     lens: Intrinsics
+    corners: list[CornersOfImage]
+    k1_sigma: float
     pitch: TravelPitch | None = None
 
 
@@ -47,23 +51,8 @@ def lens_of_drive(
     focal_px = known.px
     middle = 0.5 * (width_px - 1.0), 0.5 * (height_px - 1.0)
     camera = Camera(width_px, height_px, focal_px, focal_px, *middle, height_m=given.height_m or UNKNOWN_HEIGHT_M)
-    recording = open_recorded(uri, camera, stride, configuration.source.topics)
-    configuration = configuration.as_lossless()
-    frames = max(1, round(_LENS_S * recording.rate_hz))
-    every = max(1, min(frames, len(recording) or frames) // UPRIGHT_IMAGES)
     edges: list[Floats] = []
-    with Inference(complete(configuration, camera, recording.rate_hz)) as inference:
-
-        def images() -> Iterator[tuple[NDArray[np.uint8], Floats]]:
-            seen = islice(offline_frames(RecordedSource(recording, configuration.source)), frames)
-            for index, frame in enumerate(with_progress(seen, "lens", min(frames, len(recording)) or None)):
-                if frame.image is not None:
-                    if index % every == 0:
-                        edges.append(upright_edges(frame.image))
-                    found = inference.start(frame).result().detections
-                    yield frame.image, np.zeros((0, 4)) if found is None else found.boxes_px
-
-        corners = followed_corners(images(), camera)
+    corners = corners_of_drive(configuration, uri, camera, stride, edges)
     uprights = lens_by_uprights(edges)
     known = with_uprights(known, uprights, width_px)
     focal_px, sigma_rel, by = known.px, known.sigma_rel, known.by
@@ -87,7 +76,7 @@ def lens_of_drive(
             f"{by}; {shape}",
             sigma_focal_px=focal_px * sigma_rel,
         )
-        return LensOfDrive(assumed)
+        return LensOfDrive(assumed, corners, SIGMA_K1)
     if lens is None:
         raise CalibrationError(
             f"{uri}: its images do not show its lens: the car hardly drives in its first {_LENS_S:g} s, or little is "
@@ -111,7 +100,31 @@ def lens_of_drive(
         ),
         sigma_focal_px=lens.focal_px * lens.focal_sigma_rel,
     )
-    return LensOfDrive(found, lens.pitch)
+    return LensOfDrive(found, corners, lens.k1_sigma, lens.pitch)
+
+
+def corners_of_drive(
+    configuration: Configuration, uri: str, camera: Camera, stride: int, edges: list[Floats] | None = None
+) -> list[CornersOfImage]:
+    """Corners of a film's raw images, outside vehicles; `edges` takes what looks upright in some of them."""
+    configuration = configuration.as_lossless()
+    raw = msgspec.structs.replace(camera, distortion=(), fisheye=False)
+    recording = open_recorded(uri, raw, stride, configuration.source.topics)
+    frames = max(1, round(_LENS_S * recording.rate_hz))
+    every = max(1, min(frames, len(recording) or frames) // UPRIGHT_IMAGES)
+    with Inference(complete(configuration, raw, recording.rate_hz)) as inference:
+
+        def images() -> Iterator[tuple[NDArray[np.uint8], Floats, float]]:
+            seen = islice(offline_frames(RecordedSource(recording, configuration.source)), frames)
+            for index, frame in enumerate(with_progress(seen, "lens", min(frames, len(recording)) or None)):
+                if frame.image is not None:
+                    if edges is not None and index % every == 0:
+                        edges.append(upright_edges(frame.image))
+                    found = inference.start(frame).result().detections
+                    boxes_px = np.zeros((0, 4)) if found is None else found.boxes_px
+                    yield frame.image, boxes_px, frame.t_source_ns / NS_PER_S
+
+        return followed_corners(images(), raw)
 
 
 def with_uprights(known: FocalLength, uprights: LensByUprights | None, width_px: int) -> FocalLength:

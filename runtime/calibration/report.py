@@ -9,13 +9,21 @@ import numpy as np
 
 from birdslam.calibration.calibration import Calibration
 from birdslam.calibration.intrinsics import Intrinsics
+from birdslam.calibration.readout import USUAL, Readout
 from birdslam.geometry.camera import Camera
 from birdslam.outputs.drive_files import ResultsError
 from birdslam.runtime.calibration.height import AGREES_SIGMA, HeightBy
 from birdslam.sources.camera_file import camera_text
 
 
-def report(found: Calibration, camera: Camera, height_by: HeightBy, uri: str, lens: Intrinsics | None) -> Iterator[str]:
+def report(
+    found: Calibration,
+    camera: Camera,
+    height_by: HeightBy,
+    uri: str,
+    lens: Intrinsics | None,
+    readout: Readout | None = None,
+) -> Iterator[str]:
     if found.assumed:
         yield f"from {uri}: the road does not show the tilt; assumed {found.assumed}"
     else:
@@ -40,8 +48,8 @@ def report(found: Calibration, camera: Camera, height_by: HeightBy, uri: str, le
     yield f"height {camera.height_m:.3f} m, {height_by.words}"
     if height_by.contradicted_by:
         yield f"  CONTRADICTED: {height_by.contradicted_by}; the sigma below covers both"
-    if height_by.shutter_rel:
-        yield f"rows read in turn: +- {height_by.shutter_rel:.1%} at {found.speed_mps:.0f} m/s"
+    if readout is not None:
+        yield from _rows(readout, height_by, found.speed_mps)
     if camera.scale_sigma_rel:
         yield f"all lengths +- {camera.scale_sigma_rel:.0%}, by all of these (scale_sigma_rel)"
     for check in found.height_checks:
@@ -52,6 +60,18 @@ def report(found: Calibration, camera: Camera, height_by: HeightBy, uri: str, le
         yield f"  by {check.cue}: {check.height_m:.2f} +- {check.sigma_m:.2f} m (of {check.samples}): {verdict}"
     if not found.height_checks:
         yield "  not checked: neither poses nor a speed nor enough vehicles were there"
+
+
+def _rows(readout: Readout, height_by: HeightBy, speed_mps: float) -> Iterator[str]:
+    """How long the camera takes to read its rows, by what, and what that leaves of all lengths."""
+    leaves = f", which leaves +- {height_by.shutter_rel:.1%} at {speed_mps:.0f} m/s" if height_by.shutter_rel else ""
+    yield f"rows read in {1e3 * readout.readout_s:.0f} +- {1e3 * readout.sigma_s:.0f} ms (readout_s){leaves}"
+    if readout.by_drive is None:
+        yield "  as of most cameras: the drive does not show it"
+    else:
+        by_drive_ms, sigma_ms = (1e3 * each for each in readout.by_drive)
+        yield f"  by the drive {by_drive_ms:.0f} +- {sigma_ms:.0f} ms (of {readout.windows} windows)"
+        yield f"  by most cameras {1e3 * USUAL.readout_s:.0f} +- {1e3 * USUAL.sigma_s:.0f} ms"
 
 
 def write_camera_file(path: Path, camera: Camera, report: Sequence[str]) -> None:

@@ -21,7 +21,7 @@ from birdslam.bench.tracking.localisation import (
     summarise_ranges,
     tilt_row,
 )
-from birdslam.bench.tracking.movers import MoversRow, movers_row
+from birdslam.bench.tracking.movers import MoversRow, movers_of_draws, movers_row
 from birdslam.frontend import FrontEndConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.perception import Detections
@@ -42,26 +42,36 @@ class Sweep(NamedTuple):
 
 
 def evaluate_localisation(
-    root: Path, names: Sequence[str], detections: str, config: SlamConfig, tilt_from_images: bool = False
+    root: Path,
+    names: Sequence[str],
+    detections: str,
+    config: SlamConfig,
+    tilt_from_images: bool = False,
+    draws: int = 1,
 ) -> tuple[list[LocalisationRow], list[TiltRow], list[MoversRow]]:
     """The errors of the placed cars by range, of the roads that they were placed on, and false movers.
 
-    `detections`: "rrc" or a folder as det_02_rrc; `tilt_from_images` as in `measure`. Raises DatasetError.
+    `detections`: "rrc" or a folder as det_02_rrc; `tilt_from_images` as in `measure`, whose error is drawn `draws`
+    times: all draws count together. Raises DatasetError.
     """
     sequences = [open_tracking(root, name, CAMERA_OF_BOXES) for name in names]
-    with Progress("localisation", sum(map(len, sequences))) as progress:
+    with Progress("localisation", draws * sum(map(len, sequences))) as progress:
         progress.reach(0)
         errors: list[CarError] = []
         tilts: list[TiltRow] = []
         movers: list[MoversRow] = []
         for sequence in sequences:
             found = read_detections(_folder(root, detections), sequence.name, len(sequence))
-            log = measure(sequence, found, config.frontend, tilt_from_images)
-            errors += match_cars(sequence, log)
-            tilts.append(tilt_row(sequence, log))
-            graph = PoseGraph(config.graph, config.weights)
-            movers.append(movers_row(sequence, log, [graph.optimise(record) for record in log], "truth"))
-            progress.advance(len(sequence))
+            logs, drawn = [], []
+            for draw in range(draws):
+                log = measure(sequence, found, config.frontend, tilt_from_images, draw)
+                errors += match_cars(sequence, log)
+                graph = PoseGraph(config.graph, config.weights)
+                drawn.append(movers_row(sequence, log, [graph.optimise(record) for record in log], "truth"))
+                logs += log
+                progress.advance(len(sequence))
+            tilts.append(tilt_row(sequence, logs))
+            movers.append(movers_of_draws(drawn))
     return summarise_ranges(errors), tilts, movers
 
 

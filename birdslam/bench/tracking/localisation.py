@@ -98,14 +98,18 @@ class TiltRow(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def measure(
-    sequence: TrackingSequence, detections: Sequence[Detections], config: FrontEndConfig, tilt_from_images: bool = False
+    sequence: TrackingSequence,
+    detections: Sequence[Detections],
+    config: FrontEndConfig,
+    tilt_from_images: bool = False,
+    draw: int = 0,
 ) -> list[Measurements]:
     """The front end over a sequence of known ego motion.
 
     Of the road it knows only the calibrated camera, or, with `tilt_from_images`, its pitch too with the error that
-    images give it with.
+    images give it with; `draw` is the seed of that error.
     """
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(draw)
     simulated = SimulatedOdometry(sequence.camera, sequence.camera_poses, EXACT, rng)
     odometry: EgoMotion = simulated
     if tilt_from_images:

@@ -79,6 +79,12 @@ def movers_row(
     )
 
 
+def movers_of_draws(rows: Sequence[MoversRow]) -> MoversRow:
+    """The tracks of all draws of one sequence together."""
+    counts = {name: sum(getattr(row, name) for row in rows) for name in ("standing", "driving", "reported", "soon")}
+    return msgspec.structs.replace(rows[0], false=tuple(one for row in rows for one in row.false), **counts)
+
+
 def label_speeds_mps(sequence: TrackingSequence) -> dict[tuple[int, int], float]:
     """Over the ground, by (label, frame); labels jitter by centimetres, so that it is over HALF_SPAN both ways."""
     places = {

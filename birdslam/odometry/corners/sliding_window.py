@@ -130,6 +130,14 @@ class SlidingWindow:
         """(M,) 1 / z of the landmarks in a camera at `pose`; NaN where unknown or behind it."""
         return self.seen_from(pose)[1]
 
+    def inverse_depths_of(self, pose: Pose, ids: Ints, otherwise: Floats) -> Floats:
+        """(N,) 1 / z of the landmarks `ids` (N,) in a camera at `pose`; `otherwise` (N,) where not known."""
+        if not len(self.ids):
+            return otherwise
+        at = np.minimum(np.searchsorted(self.ids, ids), len(self.ids) - 1)
+        by_z = self.inverse_depths(pose)[at]
+        return np.where((self.ids[at] == ids) & np.isfinite(by_z), by_z, otherwise)
+
     def seen_from(self, pose: Pose) -> tuple[Floats, Floats]:
         """(3, M) the landmarks' rays (z = 1) in a camera at `pose`, (M,) 1 / z; NaN where unknown or behind it."""
         q = self._seen_from(pose)

@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera, plane_normal
-from birdslam.geometry.pose import Pose, rotation_exp
+from birdslam.geometry.pose import Pose, rotation_exp, rotation_log
+from birdslam.geometry.rolling_shutter import RollingShutter
 from birdslam.odometry.median import upper_median
 from birdslam.odometry.road.fit import MOTION, ROAD, Gradients, RoadFit, fit_without_prior
 from birdslam.odometry.road.length_information import OTHER_LENGTHS_LOG, length_information
@@ -35,7 +36,9 @@ _MAX_STEP = np.array([0.1, 0.1, 0.1, 0.005] + [0.1] * MOTION)  # of one iteratio
 _STEP_UNITS = np.array([1.0, 1.0, 1.0, 0.05] + [3.0] * MOTION)
 _MIN_DEPTH, _MIN_VISIBLE = 1e-3, 0.05  # depths, in m along the past camera's axis
 _MIN_DETERMINANT = 1e-3  # of the map from the present to the past image: a smaller area shows no gradient
+_NONE = np.zeros(0)
 _LENGTH = np.eye(ROAD + MOTION)[0]
+_READ_ROUNDS = 2  # by which the row is found that a sample was read in
 _BEHIND_CREST = 0.01  # where a ray misses the parabola: the road is hidden by its crest
 
 
@@ -64,18 +67,33 @@ class RoadAlignConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class _View:
-    """Samples of the present image: rays (3, N), rays rotated to the past camera (3, N), grey values (N,)."""
+    """Samples of the present image: rays (3, N), rays rotated to the past camera (3, N), grey values (N,).
+
+    Where rows are read in turn: `turning` (3, N), how the rotated rays go on turning over the time between both images,
+    and `late` (N,), when each sample was read, as a share of that time.
+    """
 
     rays: Floats
     turned: Floats
     grey: Floats
+    turning: Floats
+    late: Floats
+    share: float = 0.0  # of that time, in which an image is read
+
+    def thinned(self, step: int) -> _View:
+        """Each `step`-th sample."""
+        parts = self.rays, self.turned, self.grey, self.turning, self.late
+        rays, turned, grey, turning, late = (np.ascontiguousarray(part[..., ::step]) for part in parts)
+        return _View(rays, turned, grey, turning, late, self.share)
 
 
 @dataclass(frozen=True)
 class _Places:
     """Samples projected to the past camera: (x, y) at z = 1, (N,) each, and their inverse depth `by_z` there.
 
-    `rho` is the inverse depth in the present camera, `root` the square root in its solution.
+    `rho` is the inverse depth in the present camera, `root` the square root in its solution. `motion` is how much of
+    the motion between both images lies between the times when a sample was read in either: 1 where all rows are read at
+    once, else (N,).
     """
 
     x: Floats
@@ -83,6 +101,7 @@ class _Places:
     by_z: Floats
     rho: Floats
     root: Floats
+    motion: Floats | float
 
 
 def _brightness(past: Floats, present: Floats) -> tuple[float, float]:
@@ -110,6 +129,7 @@ class RoadAligner:
 
     def __init__(self, camera: Camera, config: RoadAlignConfig) -> None:
         self.camera, self.config = camera, config
+        self._shutter = RollingShutter(camera)
         # The nearest row that could show road at far_m with the nose up by 3 degrees.
         horizon = camera.cy_px + camera.fy_px * (camera.height_m / config.far_m - 0.05)
         self.top_px = int(np.clip(horizon, 0, camera.height_px - 32))
@@ -161,19 +181,19 @@ class RoadAligner:
 
     def align(
         self, past: RoadImage, present: RoadImage, T_past_present: Pose, px: Ints, prior: Floats, prior_cov: Floats,
-        sigma_motion: tuple[float, float] = (0.0, 0.0),
+        sigma_motion: tuple[float, float] = (0.0, 0.0), readout_share: float = 0.0,
     ) -> RoadFit | None:  # fmt: skip
         """Fits (log lambda, pitch, roll, curvature) of the present camera with a prior; None: too few samples.
 
         The length of `T_past_present` is in the odometry's unit; lambda times it is in metres. `sigma_motion` is
-        1-sigma of its rotation and of its direction (rad); the configured ones are the least.
+        1-sigma of its rotation and of its direction (rad); the configured ones are the least. `readout_share` is the
+        time that reading an image's rows takes, as a share of that between both.
         """
         cfg = self.config
         if len(px) < cfg.min_samples:
             return None
-        fine = self._view(present, px, T_past_present)
-        parts = fine.rays, fine.turned, fine.grey
-        coarse = _View(*(np.ascontiguousarray(part[..., :: cfg.coarse_step]) for part in parts))
+        fine = self._view(present, px, T_past_present, readout_share)
+        coarse = fine.thinned(cfg.coarse_step)
         x = np.concatenate([prior, np.zeros(MOTION)])
         mean, weight_prior = x.copy(), np.zeros((ROAD + MOTION, ROAD + MOTION))
         weight_prior[:ROAD, :ROAD] = np.linalg.inv(prior_cov)
@@ -233,13 +253,18 @@ class RoadAligner:
         seen, grey = self._values(past, places)
         return grey, seen
 
-    def _view(self, present: RoadImage, px: Ints, T_past_present: Pose) -> _View:
+    def _view(self, present: RoadImage, px: Ints, T_past_present: Pose, readout_share: float = 0.0) -> _View:
         cam = self.camera
         rays = np.stack(
             [(px[:, 0] - cam.cx_px) / cam.fx_px, (px[:, 1] - cam.cy_px) / cam.fy_px, np.ones(len(px))]
         )  # fmt: skip
         grey = present.grey[px[:, 1] - present.top_px, px[:, 0]].astype(np.float64)
-        return _View(rays, T_past_present.R @ rays, grey)
+        turned = T_past_present.R @ rays
+        if not readout_share:
+            return _View(rays, turned, grey, _NONE, _NONE)
+        turning = np.cross(rotation_log(T_past_present.R), turned, axis=0)
+        late = readout_share * self._shutter.row(*px.T.astype(np.float64))
+        return _View(rays, turned, grey, turning, late, readout_share)
 
     def _places(self, view: _View, T_past_present: Pose, x: Floats) -> _Places:
         """The samples projected to the past camera, on the road and by the motion of the state `x`."""
@@ -248,9 +273,18 @@ class RoadAligner:
         below = -(plane_normal(x[1], x[2])[0] @ view.rays)
         root = np.sqrt(np.maximum(below**2 + 2.0 * height_m * x[3], _BEHIND_CREST * below**2))
         rho = (below + root) * (0.5 / height_m)
-        q = rotation_exp(x[ROAD : ROAD + 3]) @ view.turned + rho * _translation(T_past_present, x)[:, None]
+        shift = rho * _translation(T_past_present, x)[:, None]
+        q = begun = rotation_exp(x[ROAD : ROAD + 3]) @ view.turned + shift
         by_z = 1.0 / np.maximum(q[2], _MIN_DEPTH)
-        return _Places(q[0] * by_z, q[1] * by_z, by_z, rho, root)
+        if not view.share:
+            return _Places(q[0] * by_z, q[1] * by_z, by_z, rho, root, 1.0)
+        cam = self.camera
+        for _ in range(_READ_ROUNDS):
+            u, v = cam.fx_px * (q[0] * by_z) + cam.cx_px, cam.fy_px * (q[1] * by_z) + cam.cy_px
+            more = view.late - view.share * self._shutter.row(u, v)
+            q = begun + more * (shift + view.turning)
+            by_z = 1.0 / np.maximum(q[2], _MIN_DEPTH)
+        return _Places(q[0] * by_z, q[1] * by_z, by_z, rho, root, 1.0 + more)
 
     def _sample_past(self, places: _Places, past: RoadImage) -> tuple[Bools, Floats, Floats, Floats]:
         """Which samples the past image shows, its grey values there, and its gradients by x and y at z = 1."""
@@ -309,7 +343,7 @@ class RoadAligner:
         _, by_pitch, by_roll = plane_normal(x[1], x[2])
         t = _translation(T_past_present, x)
         rx, ry, rz = rotation_exp(x[ROAD : ROAD + 3]) @ view.turned
-        along = gx * t[0] + gy * t[1] + gz * t[2]
+        along = (gx * t[0] + gy * t[1] + gz * t[2]) * places.motion
         J = np.empty((ROAD + MOTION + 2, len(gx)))
         np.multiply(along, places.rho, out=J[0])
         np.divide(along, places.root, out=along)
@@ -318,7 +352,7 @@ class RoadAligner:
         np.multiply(along, by_pitch @ view.rays, out=J[1])
         np.multiply(along, by_roll @ view.rays, out=J[2])
         J[4], J[5], J[6] = ry * gz - rz * gy, rz * gx - rx * gz, rx * gy - ry * gx
-        by_length = places.rho * float(np.linalg.norm(t))
+        by_length = places.rho * places.motion * float(np.linalg.norm(t))
         np.multiply(gx, by_length, out=J[7])
         np.multiply(gy, by_length, out=J[8])
         J[9] = -1.0

@@ -163,6 +163,7 @@ class RoadScale:
         keyframe = self._keyframe(pose)
         if keyframe is not None:
             T = keyframe.pose.between(pose)
+            share = self._readout_share(T, travelled_m, view)
             if not self._was_known and not self._confirmation.begun and self.unknown:
                 self._filter.initialise_pitch(T.R.T @ T.p, view.sigma_across_m)
             bend_per_m = _bend_per_m(step.R, travelled_m)
@@ -179,11 +180,17 @@ class RoadScale:
                 if self._car.scale_factor is not None:
                     by_landmarks = self._car.scale_factor / factor
                 T = Pose(T.R, T.p * factor)
-                factor *= self._align_and_update(keyframe.corrected, frame.corrected, T, px, by_landmarks, view)
+                factor *= self._align_and_update(keyframe.corrected, frame.corrected, T, px, by_landmarks, view, share)
         measured = self._informed and self._confirmation.known  # here, in metres
         self._mount_change.update(self._filter.tilt, factor * travelled_m, measured)
         self._insert_keyframe(frame, pose, factor)
         return factor
+
+    def _readout_share(self, T_past_present: Pose, travelled_m: float, view: RoadView) -> float:
+        """The camera's readout as a share of the time between two images, which is as the way to that of a step."""
+        begin_ns, end_ns = view.interval_ns
+        step_s, length = 1e-9 * (end_ns - begin_ns), float(np.linalg.norm(T_past_present.p))
+        return self.camera.readout_s * travelled_m / (step_s * length) if step_s * length > 0.0 else 0.0
 
     def _update_vanishing_point(self, step: Pose, view: RoadView, travelled_m: float) -> None:
         """The tilt by the vanishing point of the road's lines, where there is one ahead."""
@@ -279,6 +286,7 @@ class RoadScale:
         px: NDArray[np.int64],
         by_landmarks: float | None,
         view: RoadView,
+        readout_share: float,
     ) -> float:
         """The factor by which T_past_present is too short, 1 where the alignment is rejected.
 
@@ -295,7 +303,9 @@ class RoadScale:
             # A confirmed scale must be beaten clearly: the dark below a car ahead correlates with standing still
             lead = 0.02 if not confirmation.begun else 0.1
             search = LengthSearch(self._tilt, lead, cfg.sigma_unseen_rad if confirmation.doubted else 0.0)
-        found = best_alignment(self._aligner, filter_, past, present, T, px, by_landmarks, sigma_motion, search)
+        found = best_alignment(
+            self._aligner, filter_, past, present, T, px, by_landmarks, sigma_motion, search, readout_share
+        )
         if found is None:
             return 1.0
         fit, searched, prior_cov = found

@@ -59,14 +59,16 @@ def best_alignment(
     by_landmarks: float | None,
     sigma_motion: tuple[float, float],
     search: LengthSearch | None,
+    readout_share: float = 0.0,
 ) -> tuple[RoadFit, float, Floats] | None:
     """The fit, the factor on T_past_present that it starts from, and the filter's covariance to be joined with it.
 
     The alignment starts from the expected length and, with a `search`, from the searched one and that `by_landmarks`.
-    Fits that the landmarks contradict are dropped; None where none is left.
+    Fits that the landmarks contradict are dropped; None where none is left. `readout_share` as of `RoadAligner.align`.
     """
     (prior, predicted_cov), prior_cov = filter_.prediction, filter_.cov.copy()
-    fit, factor, cov = aligner.align(past, present, T, px, prior, predicted_cov, sigma_motion), 1.0, prior_cov
+    fit = aligner.align(past, present, T, px, prior, predicted_cov, sigma_motion, readout_share)
+    factor, cov = 1.0, prior_cov
     if fit is not None and _contradicts(fit.state[0], by_landmarks):
         fit = None
     if search is not None:
@@ -78,7 +80,8 @@ def best_alignment(
         if search.tilt_sigma_rad:
             loose[1:3, 1:3] += np.eye(2) * search.tilt_sigma_rad**2
         for start in (searched,) if by_landmarks is None else (searched, by_landmarks):
-            other = aligner.align(past, present, Pose(T.R, T.p * start), px, prior, loose[:ROAD, :ROAD], sigma_motion)
+            begun = Pose(T.R, T.p * start)
+            other = aligner.align(past, present, begun, px, prior, loose[:ROAD, :ROAD], sigma_motion, readout_share)
             if other is None:
                 continue
             log_length = float(np.log(start)) + other.state[0]

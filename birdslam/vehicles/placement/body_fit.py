@@ -146,7 +146,7 @@ def _centre_cov(seen: Observation, centre_m: Floats, sigma_rel: float, sigma_m: 
     x_m, y_m = centre_m.tolist()
     length_m = seen.dimensions.sigma_length_rel * seen.dimensions.length_m / 2.0
     along = (sigma_rel * x_m) ** 2 + sigma_m**2 + length_m**2
-    return line_of_sight_cov(x_m, y_m, along, across_var(seen, x_m))
+    return line_of_sight_cov(y_m / x_m, along, across_var(seen, x_m))
 
 
 def _sigma_of_axis(resultant: float, step_rad: float) -> float:

@@ -38,6 +38,7 @@ DIMENSIONS = {
     "bus": Dimensions(11.0, 2.5, 3.1, sigma_length_rel=0.2, sigma_height_rel=0.1),
     "motorcycle": Dimensions(2.1, 0.8, 1.6, sigma_height_rel=0.12),
 }
+STEP_M = 0.1  # of a depth, over which a slope is taken
 NEAREST_M = 1.0  # a nearer vehicle is out of the image
 CENTRE_STEPS = 3  # each leaves about a tenth of the error
 HIDING_FRACTION = 0.1  # of a box's side: a nearer box that covers less hides nothing
@@ -217,11 +218,16 @@ def place(seen: Observation, log_depth: float, var_depth: float, yaw_rad: float,
     """The observation's place in ego at a depth with its variance, both of the logarithm; yaw against the ego."""
     depth_m = math.exp(log_depth)
     x_m, y_m, reach_m, outline = centre_at(seen, depth_m, yaw_rad, config)
+    slope = y_m / x_m
     if seen.cut_side and reach_m > 0.0:  # the paper stays at the face
         # What is seen of it is narrower than its outline: the rest is beside the ego, nearer than what is seen
         narrower = max(0.0, config.cut_width_rel - seen.tan_width / outline)
         hidden_m = min(config.cut_length_rel * narrower, 1.0) * 2.0 * reach_m
-        x_m, y_m, reach_m, _ = centre_at(seen, max(depth_m - hidden_m, NEAREST_M), yaw_rad, config)
+        nearest_m = max(depth_m - hidden_m, NEAREST_M)
+        x_m, y_m, reach_m, _ = centre_at(seen, nearest_m, yaw_rad, config)
+        # The one edge that is seen is a corner's, behind the centre: the centre moves along that edge's line of sight
+        farther_x_m, farther_y_m, *_ = centre_at(seen, nearest_m + STEP_M, yaw_rad, config)
+        slope = (farther_y_m - y_m) / (farther_x_m - x_m)
     of_left, of_right = seen.sigma_left**-2, seen.sigma_right**-2
 
     # An edge alone gives the centre as well as half of the outline is known; of a vehicle that leaves the image at its
@@ -236,12 +242,11 @@ def place(seen: Observation, log_depth: float, var_depth: float, yaw_rad: float,
         sigma_reach_rel = config.sigma_reach_side_rel if seen.sigma_cut is None else config.sigma_reach_cut_rel
     # x_m = depth_m + reach_m, and the depth's error is of the face: the centre does not move by more
     along = depth_m**2 * var_depth + (sigma_reach_rel * reach_m) ** 2
-    return Place(depth_m, np.array([x_m, y_m]), line_of_sight_cov(x_m, y_m, along, (x_m * sigma_across) ** 2))
+    return Place(depth_m, np.array([x_m, y_m]), line_of_sight_cov(slope, along, (x_m * sigma_across) ** 2))
 
 
-def line_of_sight_cov(x_m: float, y_m: float, along: float, across: float) -> NDArray[np.float64]:
-    """(2, 2) of variances of x_m along the line of sight and of y_m at that x_m."""
-    slope = y_m / x_m
+def line_of_sight_cov(slope: float, along: float, across: float) -> NDArray[np.float64]:
+    """(2, 2) of variances of x along a line of sight y = `slope` x, and of y at that x."""
     return np.array([[along, along * slope], [along * slope, along * slope**2 + across]])
 
 

@@ -130,7 +130,7 @@ def places_of(
     return [
         DepthPlace(
             np.array([x_m, y_m]),
-            line_of_sight_cov(x_m, y_m, sigma_depth_m**2, across_var(o, x_m)),
+            line_of_sight_cov(y_m / x_m, sigma_depth_m**2, across_var(o, x_m)),
             wrap(yaw_rad),
             sigma_yaw_rad,
             flip,

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry import bev
-from birdslam.geometry.camera import PLANE_AT_M
 
 Floats = NDArray[np.float64]
 
@@ -42,7 +41,7 @@ def expected_boxes(
     depth, height = np.exp(x[m:]), np.exp(x[at])
     below = height_m + x[at + EDGE]
     far = np.where(height_m > height, depth + reach, depth)
-    half = 0.5 * (depth - PLANE_AT_M)  # of the road's vertical curvature
+    half = bev.rise(depth, 1.0)
     level = x[PITCH] - tilt_rad[0] + x[at + TILT] + x[VERTICAL] * half
     lean = (x[ROLL] - tilt_rad[1]) * bearing + x[CROWN] * np.abs(bearing)
     bottom = bev.road_slope(depth, below) - level + lean  # Eq. 1

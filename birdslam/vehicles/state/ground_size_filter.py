@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera, GroundPlane, VerticalCurvature
-from birdslam.vehicles.placement.localisation import Observation
+from birdslam.vehicles.placement.localisation import Dimensions, Observation
 from birdslam.vehicles.state.ground_measurements import (
     COMMON,
     CROWN,
@@ -201,6 +201,13 @@ class GroundSizeFilter:
         at = COMMON + OWN * row + OUTLINE
         self._x[at] -= log_outline
         self._P[at, at] += (self.config.width_turned_rel * log_outline) ** 2
+
+    def reclassify(self, row: int, dimensions: Dimensions, log_outline: float) -> None:
+        """The vehicle is of another class: of that one is its height's prior, whose outline is greater by a factor."""
+        at = COMMON + OWN * row
+        height = dimensions.height_m, dimensions.sigma_height_rel
+        self._x, self._P = self._sizes.replace(row, self._x, self._P, (at + HEIGHT, SIZE), *height)
+        self._x[at + OUTLINE] -= log_outline
 
     def keep_rows(self, rows: Sequence[int]) -> None:
         """Forget the vehicles of all other rows; what was learned of the road from them stays."""

@@ -44,6 +44,31 @@ class SizePrior:
         self._scale2, self._weight = np.append(self._scale2, variance * weight), np.append(self._weight, weight)
         return float(shares), variance
 
+    def replace(
+        self,
+        row: int,
+        x: Floats,
+        P: Floats,
+        at: tuple[int, int],
+        height_m: float,
+        sigma_height: float,
+    ) -> tuple[Floats, Floats]:
+        """State and covariance with another prior of a vehicle's height; `at` is where log h and `common` stand."""
+        variance = max(sigma_height**2 - self.sigma_common**2, MIN_VARIANCE)
+        weight = 1.0 - 2.0 / self.dof
+        priors = (
+            (math.log(height_m), weight, variance * weight),
+            (
+                float(self.log_height[row]),
+                -float(self._weight[row]),
+                float(self._scale2[row]),
+            ),
+        )
+        for mean, share, scale2 in priors:  # the new one first: information is never negative
+            x, P = _informed(x, P, at, mean, share / scale2)
+        self.log_height[row], self._weight[row], self._scale2[row] = priors[0]
+        return x, P
+
     def keep_rows(self, rows: Sequence[int]) -> None:
         """Forget the vehicles of all other rows."""
         for name in ("log_height", "_scale2", "_weight"):
@@ -65,9 +90,14 @@ class SizePrior:
         for k in np.flatnonzero(np.abs(weight - self._weight[rows]) > _LEAST_CHANGE).tolist():
             row = rows[k]
             change = (weight[k] - self._weight[row]) / self._scale2[row]
-            Pa = P[:, at[k]] - P[:, common]
-            gain = Pa * (change / (1.0 + change * (Pa[at[k]] - Pa[common])))
-            x = x + gain * (self.log_height[row] - (x[at[k]] - x[common]))
-            P = P - np.outer(gain, Pa)
+            x, P = _informed(x, P, (int(at[k]), common), float(self.log_height[row]), float(change))
             self._weight[row] = weight[k]
         return x, P
+
+
+def _informed(x: Floats, P: Floats, at: tuple[int, int], mean: float, information: float) -> tuple[Floats, Floats]:
+    """By so much more information that log h less `common` is `mean` (Sherman, Morrison)."""
+    of_height, common = at
+    Pa = P[:, of_height] - P[:, common]
+    gain = Pa * (information / (1.0 + information * (Pa[of_height] - Pa[common])))
+    return x + gain * (mean - (x[of_height] - x[common])), P - np.outer(gain, Pa)

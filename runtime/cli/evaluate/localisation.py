@@ -31,6 +31,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--mode", choices=("default", "paper"), default="default", help="paper: Eq. 1 on level ground")
     text = "the road's pitch: with the images' error of it, as odometry on images reports it, or none"
     parser.add_argument("--tilt", choices=("images", "none"), default="images", help=text)
+    text = "how often the tilt's error is drawn anew; all draws count together"
+    parser.add_argument("--draws", type=int, default=1, metavar="N", help=text)
     text = "of whom; cyclists by boxes of the labels' hulls, with the noise of real ones"
     parser.add_argument("--class", dest="kind", choices=("car", *PEOPLE), default="car", help=text)
     text = "how each sequence fares by a constant that the others chose of these values; may be repeated"
@@ -53,6 +55,10 @@ def run(options: argparse.Namespace) -> int:
     config, tilt_from_images = configuration.slam.frontend, options.tilt == "images"
     if options.kind != "car" and options.mode == "paper":
         raise ConfigurationError("--class: --mode paper is of cars alone")
+    if options.draws < 1:
+        raise ConfigurationError(f"--draws {options.draws}: expected 1 or more")
+    if options.draws > 1 and (sweeps or options.kind != "car" or not tilt_from_images):
+        raise ConfigurationError("--draws: of cars, by the tilt of images, without --leave-one-out")
     if sweeps:
         left = evaluate_left_out(
             options.root, names, options.detections, config, sweeps, tilt_from_images, options.kind
@@ -68,7 +74,9 @@ def run(options: argparse.Namespace) -> int:
         print(table_of_tracks(tracks))
     else:
         slam = configuration.slam
-        rows, tilts, movers = evaluate_localisation(options.root, names, options.detections, slam, tilt_from_images)
+        rows, tilts, movers = evaluate_localisation(
+            options.root, names, options.detections, slam, tilt_from_images, options.draws
+        )
         write_json(output / "report.json", rows)
         write_json(output / "tilt.json", tilts)
         write_json(output / "movers.json", movers)
