@@ -1,13 +1,10 @@
 """Fixed corners: those that do not move in the image while the car drives (dirt, drops, reflections, the bonnet).
 
-They agree perfectly with one another on no motion and are never lost, so that after some seconds they outvote the
-street. A corner of the street below the horizon must move at least as far as the road behind it, which the travelled
-distance gives. Above the horizon dirt looks like what is far away. So, where enough corners below the horizon
-are fixed, the windscreen is taken to be dirty, and fixed corners above the horizon are left out too.
-
-At a start that distance is not known, and a motion by corners on drops is none of a car: on KITTI 0002 behind rain it
-points 50 to 90 mrad aside and turns 4 mrad too little, and no length of it fits the road. There the street itself says
-that the car moves: where many corners below the horizon have moved far, those of all that stood are fixed.
+They agree perfectly with one another on no motion, and soon outvote the street. A corner of the street below the horizon
+must move at least as far as the road behind it, which the travelled distance gives. Above it dirt looks like what is
+far: there fixed corners are left out where enough below it are fixed. At a start that distance is not known, and a way
+by corners on drops fits no length of the road: where the street's corners below the horizon have moved far, those of
+all that stood are fixed.
 """
 
 from __future__ import annotations
