@@ -114,6 +114,9 @@ def test_a_centre_by_one_edge_moves_along_that_edges_line_of_sight() -> None:
     dx_m, dy_m = farther.centre_m - found.centre_m
     assert dy_m / dx_m == pytest.approx(of_edge, rel=0.05)
     assert found.centre_m[1] / found.centre_m[0] > 1.5 * of_edge  # no error is along the centre's own line
+    across = found.cov[1, 1] - found.cov[0, 1] ** 2 / found.cov[0, 0]
+    of_width_m = CAR.sigma_width_rel * CAR.width_m / 2.0
+    assert math.sqrt(across) == pytest.approx(math.hypot(of_width_m, x_m * seen.sigma_right), rel=0.15)
 
 
 @pytest.mark.parametrize("near_m", [4.0, 8.0, 30.0])

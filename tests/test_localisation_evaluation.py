@@ -13,12 +13,16 @@ from birdslam.bench.tracking.localisation import (
     INSIDE_2_SIGMA,
     CarError,
     LocalisationRow,
+    as_reported,
     match_cars,
     measure,
     summarise_ranges,
 )
 from birdslam.frontend import FrontEndConfig
 from birdslam.geometry.camera import Camera
+from birdslam.graph.graph_config import GraphConfig
+from birdslam.graph.pose_graph import PoseGraph
+from birdslam.graph.weights import WeightsConfig
 from birdslam.paper import PAPER
 from birdslam.perception import Detections
 from birdslam.runtime.cli.main import main
@@ -102,6 +106,22 @@ def test_rows_are_medians_by_range_and_shares_inside_the_right_ellipses() -> Non
     assert far.depth_bias_median_rel == pytest.approx(-0.1)
     assert far.yaw_error_median_deg == pytest.approx(0.0, abs=1e-6)
     assert pytest.approx((2.2957, 6.1801), abs=1e-3) == (INSIDE_1_SIGMA, INSIDE_2_SIGMA)
+
+
+def test_cut_cars_are_graded_as_planners_get_them_too() -> None:
+    sequence, detections = world(12)
+    log, graph = measure(sequence, detections, FrontEndConfig()), PoseGraph(GraphConfig(), WeightsConfig())
+    estimates = [graph.optimise(record) for record in log]
+    reported = as_reported(log, estimates)
+    ids = {edge.vehicle for edge in log[-1].cv}
+    of = {v.vehicle: estimates[-1].T_world_ego.between(v.T_world_vehicle) for v in estimates[-1].vehicles}
+    assert {edge.vehicle: edge.T_ego_vehicle for edge in reported[-1].cv} == {k: of[k] for k in ids}
+    errors = match_cars(sequence, reported)
+    rows = {(row.sequence, row.range): row for row in summarise_ranges(errors, errors)}
+    by_range = [rows["cut, graph", span] for span in ("0-15", "15-30", "30-50")]
+    assert sum(row.n for row in by_range) == sum(error.cut for error in errors) > 0
+    assert all(row.inside_1_sigma is None and row.nees is None for row in by_range)
+    assert ("cut, graph", "0-15") not in {(row.sequence, row.range) for row in summarise_ranges(errors)}
 
 
 def test_what_errors_are_made_of_is_told_apart() -> None:

@@ -16,6 +16,7 @@ from birdslam.bench.tracking.localisation import (
     CarError,
     LocalisationRow,
     TiltRow,
+    as_reported,
     match_cars,
     measure,
     summarise_ranges,
@@ -58,6 +59,7 @@ def evaluate_localisation(
     with Progress("localisation", draws * sum(map(len, sequences))) as progress:
         progress.reach(0)
         errors: list[CarError] = []
+        reported: list[CarError] = []
         tilts: list[TiltRow] = []
         movers: list[MoversRow] = []
         for sequence in sequences:
@@ -67,12 +69,14 @@ def evaluate_localisation(
                 log = measure(sequence, found, config.frontend, tilt_from_images, draw)
                 errors += match_cars(sequence, log)
                 graph = PoseGraph(config.graph, config.weights)
-                drawn.append(movers_row(sequence, log, [graph.optimise(record) for record in log], "truth"))
+                estimates = [graph.optimise(record) for record in log]
+                reported += match_cars(sequence, as_reported(log, estimates))
+                drawn.append(movers_row(sequence, log, estimates, "truth"))
                 logs += log
                 progress.advance(len(sequence))
             tilts.append(tilt_row(sequence, logs))
             movers.append(movers_of_draws(drawn))
-    return summarise_ranges(errors), tilts, movers
+    return summarise_ranges(errors, reported), tilts, movers
 
 
 def evaluate_people(

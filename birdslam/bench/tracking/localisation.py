@@ -29,7 +29,7 @@ from birdslam.perception import Detections, Perception, Ready
 from birdslam.sources.kitti import KITTI_RATE_HZ
 from birdslam.sources.kitti_tracking import TrackingSequence
 from birdslam.sources.label_projection import Label
-from birdslam.types import Measurements, VehicleEdge
+from birdslam.types import Estimate, Measurements, VehicleEdge
 
 CAMERA_OF_BOXES = 2  # labels and RRC detections were drawn in its images
 RANGES_M = ((0.0, 15.0), (15.0, 30.0), (30.0, 50.0))
@@ -145,6 +145,20 @@ def match_cars(sequence: TrackingSequence, measurements: Iterable[Measurements])
     return errors
 
 
+def as_reported(measurements: Sequence[Measurements], estimates: Sequence[Estimate]) -> list[Measurements]:
+    """The records with each CV edge's pose as the graph reports it, which knows where a vehicle was before."""
+    out = []
+    for record, estimate in zip(measurements, estimates, strict=True):
+        poses = {v.vehicle: estimate.T_world_ego.between(v.T_world_vehicle) for v in estimate.vehicles}
+        cv = [
+            msgspec.structs.replace(edge, T_ego_vehicle=poses[edge.vehicle])
+            for edge in record.cv
+            if edge.vehicle in poses
+        ]
+        out.append(msgspec.structs.replace(record, cv=tuple(cv)))
+    return out
+
+
 def ego_speeds_mps(sequence: TrackingSequence) -> Floats:
     """(N,) by its poses 0.2 s before and after."""
     frames = np.arange(len(sequence))
@@ -195,11 +209,12 @@ def _error(
     )
 
 
-def summarise_ranges(errors: Sequence[CarError]) -> list[LocalisationRow]:
+def summarise_ranges(errors: Sequence[CarError], reported: Sequence[CarError] = ()) -> list[LocalisationRow]:
     """A row for each sequence and range, then those of the union, "all", of cars that the image does not cut.
 
     After them those of parts of all: by whether the ego drives, by the age of the track, tall cars, cars of sequences
-    that chose none of the constants, and cars that the image cuts.
+    that chose none of the constants, and cars that the image cuts. `reported` are errors of `as_reported`: of the cut
+    cars of these too, since a frame alone hardly tells how far one is; their sigmas are others, so no share is in it.
     """
     whole = [e for e in errors if not e.cut]
     names = list(dict.fromkeys(error.sequence for error in errors))
@@ -213,11 +228,26 @@ def summarise_ranges(errors: Sequence[CarError]) -> list[LocalisationRow]:
     ]
     groups += [(name, [e for e in whole if of_it(e)]) for name, of_it in parts]
     groups.append(("cut", [e for e in errors if e.cut]))
-    return [
-        _row(name, f"{near:.0f}-{far:.0f}", [e for e in group if near <= e.depth_m < far])
-        for name, group in groups
-        for near, far in RANGES_M
-    ]
+    rows = [_row(name, *_within(group, span)) for name, group in groups for span in RANGES_M]
+    cut = [e for e in reported if e.cut]
+    return rows + [_places_alone(_row("cut, graph", *_within(cut, span))) for span in RANGES_M if reported]
+
+
+def _within(errors: Sequence[CarError], span: tuple[float, float]) -> tuple[str, list[CarError]]:
+    near, far = span
+    return f"{near:.0f}-{far:.0f}", [e for e in errors if near <= e.depth_m < far]
+
+
+def _places_alone(row: LocalisationRow) -> LocalisationRow:
+    return msgspec.structs.replace(
+        row,
+        inside_1_sigma=None,
+        inside_2_sigma=None,
+        inside_1_sigma_by_car=None,
+        inside_2_sigma_by_car=None,
+        nees=None,
+        depth_stated_rel=None,
+    )
 
 
 def _row(sequence: str, span: str, errors: Sequence[CarError]) -> LocalisationRow:

@@ -61,7 +61,7 @@ class LocalisationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     cut_width_rel: float = 0.7
     cut_length_rel: float = 1.0  # of its length: what it lacks, by how much narrower its box is
     sigma_reach_side_rel: float = 0.3  # 1-sigma of the way to its centre, of that way, where its lower edge is seen
-    sigma_reach_cut_rel: float = 0.75  # and where the image's bottom cuts it too
+    sigma_reach_cut_rel: float = 0.5  # and where the image's bottom cuts it too
     sigma_hidden_rel: float = 0.025  # an edge behind a nearer vehicle is the detector's guess
     cut_margin_px: float = 4.0  # an edge so near to the image's border counts as cut
     # of the box's height, at the image's bottom: detectors draw a cut edge a little inside of it
@@ -233,7 +233,12 @@ def place(seen: Observation, log_depth: float, var_depth: float, yaw_rad: float,
     # An edge alone gives the centre as well as half of the outline is known; of a vehicle that leaves the image at its
     # side the nearest face is not seen
     lopsided = (of_left - of_right) / (of_left + of_right)
-    sigma_half = seen.dimensions.sigma_width_rel * max(seen.tan_width, outline) / 2.0
+    half_outline = max(seen.tan_width, outline) / 2.0
+    if (
+        seen.cut_side
+    ):  # the depth's part of it is along that edge's line of sight: what is left is half its extent aside
+        half_outline = max(y for _, y in corners_of(seen.dimensions, yaw_rad)) / x_m
+    sigma_half = seen.dimensions.sigma_width_rel * half_outline
     sigma_across = math.hypot(
         1.0 / math.sqrt(of_left + of_right), lopsided * sigma_half, config.shape_floor_m / max(x_m, 1.0)
     )
