@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -21,6 +22,7 @@ from birdslam.odometry.odometry import Motion, Odometry, OdometryConfig
 from birdslam.odometry.road.scale import RoadScale
 from birdslam.odometry.scale_config import RoadScaleConfig
 from birdslam.sources.opening import open_recording
+from birdslam.sources.shipped_drive import DemoRecording
 from birdslam.types import Status
 from tests.cases import first
 
@@ -204,6 +206,27 @@ def test_creeping_is_not_standing() -> None:
     chained, _ = drive(truth, rate_hz=33.0)
     crept = np.linalg.norm(chained[48].p - chained[8].p)
     assert crept == pytest.approx(0.24, abs=0.04)
+
+
+def test_a_car_that_comes_to_a_stop_creeps_before_it_stands() -> None:
+    """The shipped drive at its red light: below 0.8 m/s corners move by less than counts from one image to the next."""
+    recording = DemoRecording()
+    at_m, odometry = recording.truth_poses()[:, :, 3], Odometry(recording.camera)
+    off, told = [], []
+    for frame in itertools.islice(recording.frames(720), 111):
+        boxes = [body.box_px for body in recording.truth_bodies(frame.index) if body.visible > 0.05]
+        motion = odometry.estimate(
+            odometry.track(frame.image), frame.index, frame.t_source_ns, np.array(boxes).reshape(-1, 4)
+        )
+        if motion is None:
+            continue
+        way_m = float(np.linalg.norm(at_m[motion.to_frame] - at_m[motion.from_frame]))
+        if 0.1 < way_m / (motion.to_frame - motion.from_frame) * recording.rate_hz < 1.2:
+            off.append((motion.T_prev_curr.x_m - way_m) / math.sqrt(motion.cov[0, 0]))
+            told.append(motion.standstill)
+    assert len(off) > 40
+    assert not any(told)
+    assert np.sqrt(np.mean(np.square(off))) < 1.5  # an image in which nothing moved says how far the car may have gone
 
 
 def test_turning_on_the_spot_does_not_travel() -> None:

@@ -34,9 +34,9 @@ class MotionModel:
         """0 where none was ever measured."""
         return 0.0 if self._rate is None else float(np.linalg.norm(self._rate[0]))
 
-    def update(self, step: Pose, dt_s: float) -> None:
-        """Takes T_prev_curr of a motion over `dt_s`."""
-        self._rate, self.interval_s = (step.p / dt_s, rotation_log(step.R) / dt_s), dt_s
+    def update(self, step: Pose, dt_s: float, over_s: float) -> None:
+        """Takes T_prev_curr of a motion `over_s`, of which the last image took `dt_s`."""
+        self._rate, self.interval_s = (step.p / over_s, rotation_log(step.R) / over_s), dt_s
 
     def stop(self) -> None:
         """Zero velocity."""

@@ -59,9 +59,11 @@ class MotionRecords:
         sigma_m = math.sqrt(float(along @ cov6[:3, :3] @ along))
         return sigma_m > max(self.invalid_sigma_rel * length_m, _VAGUE_M)
 
-    def standing(self, frames: tuple[int, int]) -> Motion:
-        """Of a zero-velocity update."""
-        return self._record(frames, NO_MOTION, SE2(), stationary_cov(self.config), [Status.STANDSTILL])
+    def standing(self, frames: tuple[int, int], unseen_m: float) -> Motion:
+        """Of a zero-velocity update; no standstill with `unseen_m`, 1-sigma of a motion that was not seen."""
+        cov = stationary_cov(self.config)
+        cov[0, 0] += unseen_m**2
+        return self._record(frames, NO_MOTION, SE2(), cov, [] if unseen_m else [Status.STANDSTILL])
 
     def coasted(self, frames: tuple[int, int], dt_s: float, status: list[Status], car: CarMotion | None) -> Motion:
         """The motion model's prediction, or wheel odometry where the car reports its speed."""

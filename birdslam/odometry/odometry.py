@@ -218,7 +218,7 @@ class Odometry:
             info = info / cfg.motion.night_inflation
         if stationary:
             # The pose is held, so this frame is as good a start of the next motion as the one that the car stopped in.
-            motion = self._stand(frame_id)
+            motion = self._stand(frame_id, dt_s)
         else:
             pose, info, predicted_sigma_m = self._apply_velocity_prior(pose, info, dt_s)
             self._window.extend(frame_id, pose, corners.ids, corners.xy, predicted_sigma_m)
@@ -230,7 +230,7 @@ class Odometry:
                 self._scale.speed_predicted(predicted_sigma_m / max(step_length, predicted_sigma_m))
             cov6 = step_cov(cfg.motion, info)
             metric_step = self._scale_to_metres(pose, cov6, tracks, boxes_px, road_mask, flow_px, interval_ns)
-            motion = self._move(frame_id, metric_step, cov6, dt_s)
+            motion = self._move(frame_id, metric_step, cov6, dt_s, corners.displacement_px)
             self._tracker.accept(tracks)
         self._reference_frame, self._reference_t_ns = frame_id, t_source_ns
         self._road_tracks = self._tracks_on_road(tracks, boxes_px, road_mask)
@@ -381,14 +381,22 @@ class Odometry:
         prior.update(sigma_m, dt_s)
         return pose, info + np.diag([inflation / sigma_m**2] * 3 + [0.0] * 3), sigma_m
 
-    def _move(self, frame_id: int, step: Pose, cov6: Floats, dt_s: float) -> Motion:
-        self._model.update(step, dt_s)
+    def _move(self, frame_id: int, step: Pose, cov6: Floats, dt_s: float, displacement_px: Floats) -> Motion:
+        length_m = float(np.linalg.norm(step.p))
+        over_s, earlier_m = self._standing.moved(displacement_px, length_m, dt_s)
+        self._model.update(step, dt_s, over_s)
+        if earlier_m > 0.0:
+            along = step.p / length_m
+            cov6 = cov6.copy()
+            cov6[:3, :3] += earlier_m**2 * np.outer(along, along)
         return self._records.measured(self._frames(frame_id), step, cov6, self._obstructed)
 
-    def _stand(self, frame_id: int) -> Motion:
-        self._model.stop()
-        self._velocity_prior.update(0.0, 1.0)
-        return self._records.standing(self._frames(frame_id))
+    def _stand(self, frame_id: int, dt_s: float) -> Motion:
+        unseen_m = self._standing.stood(dt_s)
+        if not unseen_m:
+            self._model.stop()
+            self._velocity_prior.update(0.0, 1.0)
+        return self._records.standing(self._frames(frame_id), unseen_m)
 
     def _coast(self, frame_id: int, dt_s: float, status: list[Status], car: CarMotion | None) -> Motion:
         """The reference image stays."""

@@ -1,6 +1,6 @@
 """Fixed corners: those that do not move in the image while the car drives (dirt, drops, reflections, the bonnet).
 
-They agree perfectly with one another on no motion, and soon outvote the street. Below the horizon a corner of the street
+They agree perfectly with one another on no motion, and soon outvote the street. Below the horizon a corner of it
 must move at least as far as the road behind it, which the travelled distance gives. Above it dirt looks like what is
 far: there fixed corners are left out where enough below it are fixed. At a start that distance is not known, and a way
 by corners on drops fits no length of the road: where the street's corners below the horizon have moved far, those of

@@ -5,6 +5,8 @@ They may be on the glass: then the near road must be seen to stand (stillness.py
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,10 +21,14 @@ Floats = NDArray[np.float64]
 
 _STILL_OUTER_PX = 1.5  # four of five corners have moved less where the median has not
 _MAX_HELD = 1.5  # times as long as a standstill takes to be told
+# A stop is told where the last speed would have moved the corners by so many times what counts as none; after so long
+# whatever the speed was. By judgement
+_CLEARLY, _TOLD_S = 3.0, 0.5
+_SPEED_MEMORY_S = 0.2  # of that speed: of one slow motion between two images half is noise
 
 
 class StandingDetector:
-    """State: that of the near road's stillness. Reader: `Odometry`.
+    """State: that of the near road's stillness; how far and when the corners last moved. Reader: `Odometry`.
 
     `displacement_px` (M,) is that of the corners since the reference image; `car` the motion by the car's own speed;
     `min_corners` are needed to tell.
@@ -33,6 +39,9 @@ class StandingDetector:
     ) -> None:
         self.config, self._min_corners = config, min_corners
         self.near_road = NearRoadStillness(camera, stillness)
+        self._px_per_m = 0.0  # by which the corners moved, when they did; 0: they never did
+        self._mps = 0.0  # the speed of the last motions
+        self._unmoved_s = 0.0  # since then
 
     def is_stationary(
         self,
@@ -72,6 +81,31 @@ class StandingDetector:
             return False
         too_fast = speed_mps > self.config.braking_mps2 * dt_s + self.config.speed_mps
         return unknown or obstructed or (stationary and too_fast)
+
+    def moved(self, displacement_px: Floats, length_m: float, dt_s: float) -> tuple[float, float]:
+        """A motion of `length_m` since the image in which the corners last moved.
+
+        Over how long it was (s), and how much of it may be of the images before, in which nothing was seen to move (m).
+        """
+        over_s, self._unmoved_s = min(self._unmoved_s + dt_s, max(_TOLD_S, dt_s)), 0.0
+        if len(displacement_px) and length_m > 0.0:
+            outer_px = quantile(displacement_px, 0.8)
+            if outer_px > _CLEARLY * self.config.still_px:
+                self._px_per_m = outer_px / length_m
+        self._mps += (length_m / over_s - self._mps) * -math.expm1(-over_s / _SPEED_MEMORY_S)
+        return over_s, length_m * (1.0 - dt_s / over_s)
+
+    def stood(self, dt_s: float) -> float:
+        """One more image in which nothing moved: 1-sigma of the car's motion (m), 0 where it is told to stand.
+
+        A car that creeps moves the corners in the image by less than counts as none, and in some more images by more.
+        """
+        self._unmoved_s += dt_s
+        would_move_px = self._px_per_m * self._mps * self._unmoved_s
+        if self._px_per_m == 0.0 or self._unmoved_s > _TOLD_S or would_move_px > _CLEARLY * self.config.still_px:
+            return 0.0
+        unseen_m = self.config.still_px / self._px_per_m  # at the most, since the corners last moved
+        return unseen_m * dt_s / self._unmoved_s / math.sqrt(3.0)
 
     def held_too_long(self, dt_s: float) -> bool:
         """Whether a speed was held for longer than a standstill takes to be told: what moves has left the image."""
