@@ -21,7 +21,7 @@ from birdslam.perf.accuracy.overlays import measure
 from birdslam.sources.opening import open_recording
 from birdslam.trajectory import as_poses
 from birdslam.types import Status
-from birdslam.world.windscreen import from_middle
+from birdslam.world.windscreen import from_middle, from_share
 from tests.cases import first
 
 CAMERA = Camera(640, 240, 360.0, 360.0, 320.0, 100.0, height_m=1.5)
@@ -247,6 +247,19 @@ def test_what_comes_to_stand_on_the_glass_is_no_standstill(data_dir: Path, kind:
     assert row["standstill"] == row["wrong_valid"] == 0
     assert row["valid"] >= 0.9 * row["frames"]
     assert not np.array_equal(drive.images[-1], read(task)[1].images[-1])
+
+
+@pytest.mark.parametrize("name", ["kitti_tracking/training/image_02/0002", "kitti_odometry/sequences/00"])
+def test_rain_from_the_first_image_on_does_not_draw_the_way(data_dir: Path, name: str) -> None:
+    """Two corners of three are on drops; the way by all of them points aside, where no length fits the road."""
+    seed = 1 if name.endswith("0002") else 2
+    row = measure(
+        read(Task(f"kitti:{data_dir / name}", "", False, 1, 1, 0, None), from_share("rain", seed, 0.0))[1], 0.0
+    )
+    assert row["standstill"] == 0
+    assert row["valid"] >= 0.95 * row["frames"]
+    assert row["wrong_over_three"] <= row["wrong_valid_truth_doubtful"] <= 5  # of 00 as many without rain
+    assert abs(row["scale_error"]) < 0.04
 
 
 def test_a_road_sample_strip_bends_with_the_way() -> None:

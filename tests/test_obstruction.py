@@ -25,11 +25,16 @@ def road_px(at_m: np.ndarray, across_m: np.ndarray) -> np.ndarray:
     return np.column_stack([CAMERA.cx_px + CAMERA.fx_px * across_m / at_m, CAMERA.cy_px + CAMERA.fy_px * 1.5 / at_m])
 
 
-def drive(images: int, dirt: int, step_m: float = STEP_M) -> tuple[FixedCorners, list[np.ndarray], np.ndarray]:
-    """A street of 40 points, 20 far houses, and `dirt` corners of which half are below the horizon."""
+def drive(
+    images: int, dirt: int, step_m: float = STEP_M, known: bool = True
+) -> tuple[FixedCorners, list[np.ndarray], np.ndarray]:
+    """A street of 40 points, 20 far houses, and `dirt` corners of which half are below the horizon.
+
+    `known`: the travelled distance is.
+    """
     rng = np.random.default_rng(3)
     fixed_corners = FixedCorners(CAMERA, FixedCornersConfig())
-    at_m, across_m = rng.uniform(8.0, 60.0, 40), rng.uniform(-6.0, 6.0, 40)
+    at_m, across_m = rng.uniform(8.0 if known else 5.0, 60.0 if known else 15.0, 40), rng.uniform(-6.0, 6.0, 40)
     across_m[np.abs(across_m) < 1.0] += 2.0
     houses = np.column_stack([rng.uniform(20.0, 620.0, 20), rng.uniform(5.0, 80.0, 20)])
     spots = np.column_stack(
@@ -42,13 +47,14 @@ def drive(images: int, dirt: int, step_m: float = STEP_M) -> tuple[FixedCorners,
         far = [320.0, 96.0] + (houses - [320.0, 96.0]) * (60.0 / (60.0 - k * step_m))
         px = np.concatenate([road_px(ahead_m[seen], across_m[seen]), far, spots])
         ids = np.concatenate([np.flatnonzero(seen), 100 + np.arange(20), 200 + np.arange(dirt)])
-        fixed = fixed_corners.update(ids, px, GROUND, step_m if k else 0.0)
+        fixed = fixed_corners.update(ids, px, GROUND, (step_m if k else 0.0) if known else None)
         found.append(fixed)
     return fixed_corners, found, ids
 
 
-def test_a_clean_windscreen_shows_nothing_that_stands() -> None:
-    fixed_corners, found, _ = drive(8, 0)
+@pytest.mark.parametrize("known", [True, False])
+def test_a_clean_windscreen_shows_nothing_that_stands(known: bool) -> None:
+    fixed_corners, found, _ = drive(8, 0, known=known)
     assert not fixed_corners.present
     assert not np.concatenate(found).any()
 
@@ -60,8 +66,27 @@ def test_dirt_is_told_from_the_street_above_the_horizon_too() -> None:
     assert not found[-1][ids < 200].any()
 
 
-def test_a_standing_car_has_no_dirt() -> None:
-    fixed_corners, found, _ = drive(10, 40, step_m=0.0)
+def test_what_stands_is_told_by_the_streets_own_motion_where_no_length_is_known() -> None:
+    fixed_corners, found, ids = drive(3, 40, known=False)
+    assert fixed_corners.present
+    assert found[-1][ids >= 200].all()
+    assert not found[-1][ids < 100].any()
+
+
+def test_a_stretch_begins_anew_where_most_corners_were_lost() -> None:
+    fixed_corners, px = FixedCorners(CAMERA, FixedCornersConfig()), np.full((20, 2), [300.0, 165.0])
+    px[:, 0] += np.arange(20)
+    fixed_corners.begin(np.arange(20), px)
+    for first_id in (20, 40):
+        assert not fixed_corners.update(first_id + np.arange(20), px, GROUND, None).any()
+    moved = px + [[0.0, 20.0]] * (np.arange(20) < 8)[:, None]
+    fixed = fixed_corners.update(40 + np.arange(20), moved, GROUND, None)
+    assert (fixed == (np.arange(20) >= 8)).all()
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_standing_car_has_no_dirt(known: bool) -> None:
+    fixed_corners, found, _ = drive(10, 40, step_m=0.0, known=known)
     assert not fixed_corners.present
     assert not np.concatenate(found).any()
 

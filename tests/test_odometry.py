@@ -15,8 +15,12 @@ import pytest
 
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.pose import Pose, rotation_exp, rotation_log
-from birdslam.odometry.motion import planar
+from birdslam.odometry.motion import MotionConfig, planar
+from birdslam.odometry.motion_model import MotionModel
+from birdslam.odometry.motion_records import MotionRecords
 from birdslam.odometry.odometry import Motion, Odometry, OdometryConfig
+from birdslam.odometry.road.scale import RoadScale
+from birdslam.odometry.scale_config import RoadScaleConfig
 from birdslam.sources.opening import open_recording
 from birdslam.sources.shipped_drive import DemoRecording
 from birdslam.types import Status
@@ -423,6 +427,22 @@ def test_settings_are_typed_and_closed() -> None:
         msgspec.convert({"keyframe": 5}, OdometryConfig)
     with pytest.raises(msgspec.ValidationError):
         msgspec.convert({"reject_px": -1.0}, OdometryConfig)
+
+
+class KnownScale(RoadScale):
+    """A unit of length that is known to a percent."""
+
+    sigma_rel = 0.01
+
+
+@pytest.mark.parametrize(("step_m", "sigma_m", "valid"), [(1.0, 0.02, True), (1.0, 0.2, False), (0.02, 0.008, True)])
+def test_a_step_whose_own_length_is_vague_is_not_to_be_driven_by(step_m: float, sigma_m: float, valid: bool) -> None:
+    """However well the unit of length is known: behind heavy rain few corners are the street's."""
+    scale = KnownScale(CAMERA, RoadScaleConfig())
+    records = MotionRecords(MotionConfig(), 1.7, scale, MotionModel(), RoadScaleConfig().invalid_sigma_rel)
+    cov6 = np.diag([0.001**2, 0.001**2, sigma_m**2, 1e-8, 1e-8, 1e-8])
+    motion = records.measured((0, 1), Pose(np.eye(3), np.array([0.0, 0.0, step_m])), cov6, False)
+    assert (Status.SCALE_INVALID not in motion.status) == valid
 
 
 def test_twice_the_same_bytes() -> None:

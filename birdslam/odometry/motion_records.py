@@ -27,6 +27,8 @@ from birdslam.types import SpeedSource, Status
 
 Floats = NDArray[np.float64]
 
+_VAGUE_M = 0.01  # of a step's length, 1-sigma: a car that creeps may know its steps to a half
+
 
 @dataclass(frozen=True)
 class MotionRecords:
@@ -36,6 +38,7 @@ class MotionRecords:
     camera_ahead_m: float  # of the rear axle
     scale: MetricScale
     model: MotionModel
+    invalid_sigma_rel: float  # of a length: no better known, it is not to be driven by
 
     def measured(self, frames: tuple[int, int], step: Pose, cov6: Floats, obstructed: bool) -> Motion:
         """Of a step T_prev_curr in metres with covariance (6, 6); `obstructed`: fixed corners were left out."""
@@ -44,7 +47,17 @@ class MotionRecords:
         status = self.scale.status()
         if obstructed and Status.VIEW_OBSTRUCTED not in status:
             status.append(Status.VIEW_OBSTRUCTED)
+        by_images = SpeedSource.CAR not in self.scale.sources
+        if by_images and self._is_vague(step, cov6) and Status.SCALE_INVALID not in status:
+            status.append(Status.SCALE_INVALID)
         return self._record(frames, step, T_prev_curr, cov, status)
+
+    def _is_vague(self, step: Pose, cov6: Floats) -> bool:
+        """Whether the corners leave the step's own length unknown, however well the unit of length is known."""
+        length_m = float(np.linalg.norm(step.p))
+        along = step.p / max(length_m, 1e-9)
+        sigma_m = math.sqrt(float(along @ cov6[:3, :3] @ along))
+        return sigma_m > max(self.invalid_sigma_rel * length_m, _VAGUE_M)
 
     def standing(self, frames: tuple[int, int], unseen_m: float) -> Motion:
         """Of a zero-velocity update; no standstill with `unseen_m`, 1-sigma of a motion that was not seen."""

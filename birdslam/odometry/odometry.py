@@ -86,7 +86,9 @@ class Odometry:
         self._reference_t_ns = 0
         self._reference_seen = True  # False: it was reached by the car's own speed alone
         self._model = MotionModel()
-        self._records = MotionRecords(cfg.motion, cfg.start.camera_ahead_m, self._scale, self._model)
+        self._records = MotionRecords(
+            cfg.motion, cfg.start.camera_ahead_m, self._scale, self._model, cfg.road.invalid_sigma_rel
+        )
         self._velocity_prior = ConstantVelocityPrior(cfg.constant_velocity)
         self._selector = CornerSelector(self.camera, cfg.fixed_corners, cfg.below_plane)
         self._standing = StandingDetector(self.camera, cfg.zero_velocity, cfg.stillness, cfg.min_fitting)
@@ -257,7 +259,7 @@ class Odometry:
     ) -> tuple[Corners, PoseEstimate | None]:
         """The corners used, and the present image's pose in the window's frame; None where it is unknown."""
         cfg, scale = self.config, self._scale
-        driven_m = self._model.speed_mps * dt_s if scale.sigma_rel < _KNOWN_SCALE_SIGMA_REL else 0.0
+        driven_m = self._model.speed_mps * dt_s if scale.sigma_rel < _KNOWN_SCALE_SIGMA_REL else None
         selected = self._selector.select(tracks, self._tracker.reference, boxes_px, scale.ground, driven_m)
         predicted = self._pose @ self._model.predict(dt_s)
         selected = replace(selected, xy=self._at_middle(selected.ids, selected.xy, predicted))
