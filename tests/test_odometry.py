@@ -435,13 +435,13 @@ class KnownScale(RoadScale):
     sigma_rel = 0.01
 
 
-@pytest.mark.parametrize(("step_m", "sigma_m", "valid"), [(1.0, 0.02, True), (1.0, 0.2, False), (0.02, 0.008, True)])
+@pytest.mark.parametrize(("step_m", "sigma_m", "valid"), [(1.0, 0.02, True), (1.0, 0.2, False), (0.02, 0.02, True)])
 def test_a_step_whose_own_length_is_vague_is_not_to_be_driven_by(step_m: float, sigma_m: float, valid: bool) -> None:
     """However well the unit of length is known: behind heavy rain few corners are the street's."""
     scale = KnownScale(CAMERA, RoadScaleConfig())
     records = MotionRecords(MotionConfig(), 1.7, scale, MotionModel(), RoadScaleConfig().invalid_sigma_rel)
     cov6 = np.diag([0.001**2, 0.001**2, sigma_m**2, 1e-8, 1e-8, 1e-8])
-    motion = records.measured((0, 1), Pose(np.eye(3), np.array([0.0, 0.0, step_m])), cov6, False)
+    motion = records.measured((0, 1), Pose(np.eye(3), np.array([0.0, 0.0, step_m])), cov6, False, 0.1, 0.0)
     assert (Status.SCALE_INVALID not in motion.status) == valid
 
 

@@ -27,7 +27,7 @@ from birdslam.types import SpeedSource, Status
 
 Floats = NDArray[np.float64]
 
-_VAGUE_M = 0.01  # of a step's length, 1-sigma: a car that creeps may know its steps to a half
+_VAGUE_MPS = 1.0  # of a speed, 1-sigma: a car that creeps may know its steps to a half
 
 
 @dataclass(frozen=True)
@@ -40,24 +40,30 @@ class MotionRecords:
     model: MotionModel
     invalid_sigma_rel: float  # of a length: no better known, it is not to be driven by
 
-    def measured(self, frames: tuple[int, int], step: Pose, cov6: Floats, obstructed: bool) -> Motion:
-        """Of a step T_prev_curr in metres with covariance (6, 6); `obstructed`: fixed corners were left out."""
+    def measured(
+        self, frames: tuple[int, int], step: Pose, cov6: Floats, obstructed: bool, dt_s: float, earlier_m: float
+    ) -> Motion:
+        """Of a step T_prev_curr in metres over `dt_s` with covariance (6, 6); `obstructed`: corners were left out.
+
+        So much as `earlier_m` of it may be of the images before, in which nothing was seen to move.
+        """
         T_prev_curr = planar(step, self.scale.ground)
         cov = measured_cov(self.config, cov6, T_prev_curr, self.scale.ground, self.scale.sigma_rel)
+        cov[0, 0] += earlier_m**2
         status = self.scale.status()
         if obstructed and Status.VIEW_OBSTRUCTED not in status:
             status.append(Status.VIEW_OBSTRUCTED)
         by_images = SpeedSource.CAR not in self.scale.sources
-        if by_images and self._is_vague(step, cov6) and Status.SCALE_INVALID not in status:
+        if by_images and self._is_vague(step, cov6, dt_s) and Status.SCALE_INVALID not in status:
             status.append(Status.SCALE_INVALID)
         return self._record(frames, step, T_prev_curr, cov, status)
 
-    def _is_vague(self, step: Pose, cov6: Floats) -> bool:
+    def _is_vague(self, step: Pose, cov6: Floats, dt_s: float) -> bool:
         """Whether the corners leave the step's own length unknown, however well the unit of length is known."""
         length_m = float(np.linalg.norm(step.p))
         along = step.p / max(length_m, 1e-9)
         sigma_m = math.sqrt(float(along @ cov6[:3, :3] @ along))
-        return sigma_m > max(self.invalid_sigma_rel * length_m, _VAGUE_M)
+        return sigma_m > max(self.invalid_sigma_rel * length_m, _VAGUE_MPS * dt_s)
 
     def standing(self, frames: tuple[int, int], unseen_m: float) -> Motion:
         """Of a zero-velocity update; no standstill with `unseen_m`, 1-sigma of a motion that was not seen."""

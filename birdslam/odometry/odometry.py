@@ -385,11 +385,7 @@ class Odometry:
         length_m = float(np.linalg.norm(step.p))
         over_s, earlier_m = self._standing.moved(displacement_px, length_m, dt_s)
         self._model.update(step, dt_s, over_s)
-        if earlier_m > 0.0:
-            along = step.p / length_m
-            cov6 = cov6.copy()
-            cov6[:3, :3] += earlier_m**2 * np.outer(along, along)
-        return self._records.measured(self._frames(frame_id), step, cov6, self._obstructed)
+        return self._records.measured(self._frames(frame_id), step, cov6, self._obstructed, dt_s, earlier_m)
 
     def _stand(self, frame_id: int, dt_s: float) -> Motion:
         unseen_m = self._standing.stood(dt_s)
