@@ -25,7 +25,8 @@ class Status(Word):
     LOW_TEXTURE = "low_texture"  # too few feature tracks to measure the motion
     ODOMETRY_COASTING = "odometry_coasting"  # the motion is predicted by the motion model, not measured
     SCALE_CARRIED = "scale_carried"  # no road is seen: the metric scale is an older one
-    SCALE_INVALID = "scale_invalid"  # the metric scale is unknown, or has been carried for too long
+    # the metric scale is unknown or has been carried for too long, or the images leave the length of this motion open
+    SCALE_INVALID = "scale_invalid"
     MOTION_IMPLAUSIBLE = "motion_implausible"  # the motion is no car's, or was long not measured; until it is steady
     STANDSTILL = "standstill"  # zero-velocity update: the car stands and its pose is held
     GROUND_VIOLATED = "ground_violated"  # alignments of the road keep contradicting the estimated ground plane
