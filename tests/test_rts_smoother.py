@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -127,6 +128,10 @@ def measured(
     return out
 
 
+def replace_edge(one: VehicleMeasurement, **changes: object) -> VehicleMeasurement:
+    return dataclasses.replace(one, edge=replace(one.edge, **changes))
+
+
 def along(seen: list[VehicleMeasurement]) -> Floats:
     return np.array([pose.x_m for pose in smooth_vehicle(seen, CONFIG).values()])
 
@@ -138,6 +143,16 @@ def test_a_size_known_in_the_end_moves_every_measurement_by_what_its_depth_owed_
     assert np.abs(along(measured(seen_m, assumed, depth_per_height=1.0)) - 40.0).max() < 0.05
     assert np.abs(along(measured(seen_m, assumed, depth_per_height=0.0)) - 40.0).max() > 2.0
     assert smooth_vehicle(measured(seen_m[:1], assumed[:1], 1.0), CONFIG)[0].x_m == pytest.approx(seen_m[0])
+
+
+def test_what_a_cut_car_lies_along_another_line_stays_uncertain() -> None:
+    """Its error is along the line of sight of the one edge that is seen, most of it by its height."""
+    seen = [
+        replace_edge(one, T_ego_vehicle=SE2(4.0, 3.0, 0.0), cov=(0.5, 0.6, 0.0, 0.6, 0.73, 0.0, 0.0, 0.0, 0.01))
+        for one in measured(np.array([4.0, 4.0, 4.0]), 0.4, 1.0, sigma_log_height=0.5)
+    ]
+    for pose in smooth_vehicle(seen, CONFIG).values():
+        assert np.hypot(pose.x_m - 4.0, pose.y_m - 3.0) < 0.5
 
 
 def test_a_last_look_that_is_less_sure_of_the_size_moves_little() -> None:

@@ -125,7 +125,8 @@ def _size_corrected(seen: Sequence[VehicleMeasurement]) -> tuple[Floats, Floats]
         R = SE2(yaw_rad=T.yaw_rad).rotation()
         cov = R @ np.reshape(edge.cov, (3, 3))[:2, :2] @ R.T  # an edge has it in the vehicle's axes
         of_height = (edge.depth_per_height * edge.sigma_log_height) ** 2
-        most = (1.0 - MIN_COV_SHARE) * float(cov[0, 0]) / max(sight_line[0] ** 2, 1e-9)
+        # Whatever else is uncertain stays so: of a cut vehicle most of it lies along another line
+        most = (1.0 - MIN_COV_SHARE) / max(float(sight_line @ np.linalg.solve(cov, sight_line)), 1e-9)
         cov = cov - min(of_height, most) * np.outer(sight_line, sight_line)
         R_world_ego = one.T_world_ego.rotation()
         places[k] = one.T_world_ego @ (centre + growth * sight_line)
