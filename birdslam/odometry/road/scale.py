@@ -210,12 +210,12 @@ class RoadScale:
             self.vanishing_point = found
 
     def _update_bonnet(self, view: RoadView, travelled_m: float) -> None:
-        """Where a bonnet has been taken for road until it was found, scale and tilt are dropped."""
+        """Where a bonnet has been taken for road until it was found, what it told is dropped."""
         driven_m = travelled_m if self._confirmation.begun else None
         if self._obstructions.bonnet_changed(view.grey, driven_m, view.flow_px):
-            self._filter.reset_scale(1.0)
-            self._filter.lose_tilt()
+            self._filter.forget_road()
             self._confirmation.forget()
+            self._was_known = False
 
     def _landmark_scale(self, window: SlidingWindow) -> float | None:
         """Metres in the window's unit of length by its landmarks on the road, where the scale is doubtful."""
@@ -310,13 +310,16 @@ class RoadScale:
             return 1.0
         fit, searched, prior_cov = found
         known = confirmation.known or self._car.measures
-        expected = searched != 1.0 or not known or filter_.innovation(fit)[2] < cfg.max_innovation_sigma
         least = cfg.min_correlation
         told = fit.length_information > cfg.doubt_sigma_rel**-2  # far likelier than other lengths
         log_length = float(np.log(searched)) + float(fit.state[0])
-        found_before = searched != 1.0 and confirmation.found_before(log_length)
-        if told or found_before or agrees(log_length, by_landmarks):
+        confirmed = (searched != 1.0 and confirmation.found_before(log_length)) or agrees(log_length, by_landmarks)
+        if told or confirmed:
             least *= _AGREED_CORRELATION_SHARE
+        if searched == 1.0:
+            expected = not known or filter_.innovation(fit)[2] < cfg.max_innovation_sigma
+        else:
+            expected = confirmed or confirmation.may_be(log_length)
         if fit.correlation < least or not expected:
             confirmation.reject(new, log_length if searched != 1.0 else None)
             return 1.0
