@@ -77,6 +77,7 @@ class ConstantVelocityPrior:
     def stop(self) -> None:
         """The car stands."""
         self._x, self._cov = np.zeros(2), np.diag([0.0, self.config.acceleration_mps2**2])
+        self.active, self._shown_m = False, None
 
     def rescale(self, factor: float) -> None:
         """All lengths are multiplied by it."""
@@ -127,9 +128,8 @@ class ConstantVelocityPrior:
         self.active = math.isfinite(predicted_sigma_m) and (
             largest_sigma_m(known) > max(limit * predicted_sigma_m, least_m)
         )
-        way = measured.R.T @ (predicted.p - base.p)
-        if float(np.linalg.norm(way)) < 1e-9:
-            way = measured.R.T @ base.R @ np.array([0.0, 0.0, 1.0])
+        # The car's axis and no step, which of a car that pulls away points anywhere
+        way = measured.R.T @ base.R @ on_plane(SE2(1.0, self._heading_rad, 0.0), ground).p
         along = way / float(np.linalg.norm(way))
         self._shown_m = None
         if not self.active:
