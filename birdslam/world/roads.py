@@ -285,5 +285,15 @@ ROADS: dict[str, Road] = {
     ),
     "town": Road("a street of a town with parked cars, 10 m/s", lambda: built_up(11, "urban", 10.0), 10.0),
     "avenue": Road("an avenue of a town, 13 m/s", lambda: built_up(12, "avenue", 13.0), 10.0),
+    "queue_avenue": Road(
+        "behind a van that brakes for a red light, from 14 m/s; trucks beside",
+        lambda: queue(75, "avenue", 14.0, "van"), 10.0, 70,
+    ),
+    "queue_street": Road("the same behind a car, from 10 m/s", lambda: queue(76, "urban", 10.0, "suv"), 10.0, 70),
+    "queue_sedan": Road("the same, from 13 m/s", lambda: queue(82, "avenue", 13.0, "sedan"), 10.0, 70),
+    "queue_truck": Road(
+        "behind a truck that hides the road, until both stand, from 12 m/s",
+        lambda: queue(94, "urban", 12.0, "truck", 10.0), 10.0, 110,
+    ),
     "hills": Road("a country road up and down at 6 %, 16 m/s", lambda: built_up(13, "country", 16.0, 0.06), 10.0),
 }  # fmt: skip
