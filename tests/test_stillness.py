@@ -146,3 +146,29 @@ def test_rain_over_a_rendered_drive_stops_nobody(name: str, share: float) -> Non
     row = measure(read(task, from_share("rain", 1, share))[1], share)
     assert row["standstill"] == row["wrong_valid"] == 0
     assert row["obstructed"] > 0.4 * row["frames"]
+
+
+def _noisy(speed_mps: float, contrast_grey: float, noise_grey: float, grain: bool = False) -> NearRoadStillness:
+    """The near road after 1.5 s at 20 Hz; `grain`: its texture is as fine as the pixels."""
+    rng, stillness = np.random.default_rng(3), NearRoadStillness(CAMERA, StillnessConfig())
+    for k in range(30):
+        image = road_image(0.05 * k * speed_mps, contrast_grey)
+        if grain and speed_mps:
+            image[HORIZON_PX:] = rng.normal(90.0, contrast_grey, image[HORIZON_PX:].shape)
+        stillness.update(shown(image, rng, noise_grey), k * 50_000_000, NO_BOXES)
+    return stillness
+
+
+def test_a_stop_on_faint_road_is_seen_through_noise() -> None:
+    """Noise alone changes a faint road's image by more than a seventh of its contrast: no motion is in that."""
+    stillness = _noisy(0.0, 5.0, 1.1)
+    changes = stillness.changes
+    assert changes is not None
+    assert changes[0] > StillnessConfig().contrast_share * changes[2]
+    assert stillness.proven
+
+
+@pytest.mark.parametrize("speed_mps", [0.3, 3.0, 20.0])
+def test_noise_makes_no_stop(speed_mps: float) -> None:
+    assert not _noisy(speed_mps, 5.0, 1.1).proven
+    assert not _noisy(speed_mps, 5.0, 1.0, grain=True).proven

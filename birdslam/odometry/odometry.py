@@ -17,17 +17,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
-from birdslam.geometry.pose import Pose
+from birdslam.geometry.pose import Pose, rotation_log
 from birdslam.geometry.rolling_shutter import RollingShutter
 from birdslam.odometry.corners.feature_tracks import FeatureTracker, Tracks, predict_corners_px
+from birdslam.odometry.corners.group_jackknife import length_without_a_part
 from birdslam.odometry.corners.initialisation import MotionInitialiser
 from birdslam.odometry.corners.keyframes import KeyframeWindow
 from birdslam.odometry.corners.resection import InlierLimits, PoseEstimate, pose_without_fixed_corners
 from birdslam.odometry.corners.selection import Corners, CornerSelector
 from birdslam.odometry.corners.sliding_window import match_ids
-from birdslam.odometry.corners.two_view import initial_two_view
+from birdslam.odometry.corners.two_view import initial_two_view, on_glass
 from birdslam.odometry.metric_scale import MetricScale, RoadView
-from birdslam.odometry.motion import Motion, planar, step_cov, violates_nonholonomic
+from birdslam.odometry.motion import Motion, planar, step_cov, uneven_cov, violates_nonholonomic
 from birdslam.odometry.motion_model import NO_MOTION, MotionModel
 from birdslam.odometry.motion_records import MotionRecords
 from birdslam.odometry.odometry_config import OdometryConfig
@@ -37,7 +38,7 @@ from birdslam.odometry.road.moving_median import MovingMedianScale
 from birdslam.odometry.road.points import is_night, on_road, outside
 from birdslam.odometry.road.scale import RoadScale
 from birdslam.odometry.road.vanishing_point import VanishingPoint
-from birdslam.odometry.speed.constant_velocity import ConstantVelocityPrior, largest_sigma_m
+from birdslam.odometry.speed.constant_velocity import ConstantVelocityPrior
 from birdslam.odometry.speed.scale import MOVING_M, CarMotion
 from birdslam.odometry.speed.standing import StandingDetector
 from birdslam.odometry.speed.zero_velocity import near_road_flow_px
@@ -53,6 +54,8 @@ Bools = NDArray[np.bool_]
 _MIN_INTERVAL_S = 0.004
 _KNOWN_SCALE_SIGMA_REL = 0.3  # of a scale by which the travelled distance is used
 _MOVING_MPS = 3.0  # from one image to the next a car does not stop from this
+_ONE_PART_SIGMAS = 2.0  # by which a step is another one without a part of the image
+_HELD_SIGMA_REL = 0.1  # of a step at a held speed against the others of the window, at the most
 _TWO_VIEW_INFORMATION = np.diag([1e4] * 3 + [6e4] * 3)  # of a step by two images alone: 1 cm, 0.25 deg
 _NO_TRACKS = np.zeros(0, np.int64), np.zeros((0, 2))
 _STRATEGIES: dict[str, type[RoadScale] | type[MovingMedianScale]] = {"kalman": RoadScale, "paper": MovingMedianScale}
@@ -89,7 +92,7 @@ class Odometry:
         self._records = MotionRecords(
             cfg.motion, cfg.start.camera_ahead_m, self._scale, self._model, cfg.road.invalid_sigma_rel
         )
-        self._velocity_prior = ConstantVelocityPrior(cfg.constant_velocity)
+        self._velocity_prior = ConstantVelocityPrior(cfg.constant_velocity, cfg.start.camera_ahead_m)
         self._selector = CornerSelector(self.camera, cfg.fixed_corners, cfg.below_plane)
         self._standing = StandingDetector(self.camera, cfg.zero_velocity, cfg.stillness, cfg.min_fitting)
         self._obstructed = False  # fixed corners were left out of the newest motion
@@ -220,8 +223,18 @@ class Odometry:
             # The pose is held, so this frame is as good a start of the next motion as the one that the car stopped in.
             motion = self._stand(frame_id, dt_s)
         else:
+            info = self._doubt_one_part(corners, pose, info)
+            vague = self._velocity_prior.sigma_rel > cfg.road.invalid_sigma_rel
             pose, info, predicted_sigma_m = self._apply_velocity_prior(pose, info, dt_s)
-            self._window.extend(frame_id, pose, corners.ids, corners.xy, predicted_sigma_m)
+            if vague and not self._velocity_prior.active:
+                # What the window has was placed by a speed that was hardly known
+                corners, anew = self._two_view_pose(corners, dt_s, car)
+                pose, info = anew or (pose, info)
+            # Held steps err together, which is the unit of length: one beside another they are known better
+            held_m = min(predicted_sigma_m, _HELD_SIGMA_REL * float(np.linalg.norm(pose.p - self._pose.p)))
+            self._window.extend(
+                frame_id, pose, corners.ids, corners.xy, held_m if np.isfinite(predicted_sigma_m) else np.inf
+            )
             if not self._scale.unknown:
                 self._selector.reject_below_plane(self._window, pose, self._scale.ground)
             pose = self._window.refine()
@@ -230,6 +243,9 @@ class Odometry:
                 self._scale.speed_predicted(predicted_sigma_m / max(step_length, predicted_sigma_m))
             cov6 = step_cov(cfg.motion, info)
             metric_step = self._scale_to_metres(pose, cov6, tracks, boxes_px, road_mask, flow_px, interval_ns)
+            if self._shutter.readout_s and self._model.known:
+                change_radps = rotation_log(metric_step.R) / dt_s - self._model.rate[1]
+                cov6 = uneven_cov(cov6, self._shutter.readout_s, change_radps)
             motion = self._move(frame_id, metric_step, cov6, dt_s, corners.displacement_px)
             self._tracker.accept(tracks)
         self._reference_frame, self._reference_t_ns = frame_id, t_source_ns
@@ -269,22 +285,30 @@ class Odometry:
         corners, located = pose_without_fixed_corners(self._window, selected, self._pose, guesses, limits)
         self._obstructed = corners is not selected
         self._fixed = int(selected.fixed.sum())
-        return corners, located if located is not None else self._two_view_pose(corners, dt_s, car)
+        return (corners, located) if located is not None else self._two_view_pose(corners, dt_s, car)
 
-    def _two_view_pose(self, corners: Corners, dt_s: float, car: CarMotion | None) -> PoseEstimate | None:
-        """Starts the window anew from the reference image and this one."""
+    def _two_view_pose(
+        self, corners: Corners, dt_s: float, car: CarMotion | None
+    ) -> tuple[Corners, PoseEstimate | None]:
+        """Starts the window anew from the reference image and this one; the corners used."""
         cfg, reference = self.config, self._tracker.reference
         a, b = match_ids(reference.ids, corners.ids)
         if len(a) < cfg.min_fitting:
-            return None
+            return corners, None
         xy_a, xy_b = self.camera.to_xy(reference.px[a]), corners.xy[b]
         xy_a = self._at_middle(reference.ids[a], xy_a, self._pose)
         if self._seems_still(corners):
-            return self._pose, _TWO_VIEW_INFORMATION
+            return corners, (self._pose, _TWO_VIEW_INFORMATION)
         guess = self._searched if self._searched is not None else self._model.predict(dt_s)
+        glass = on_glass(xy_a, xy_b, guess, self._focal_px, cfg.two_view_px)
+        if glass.any():
+            told = np.isin(corners.ids, reference.ids[a[glass]])
+            corners = self._selector.tell_on_glass(corners, told, reference)
+            self._obstructed, self._fixed = True, self._fixed + int(glass.sum())
+            a, xy_a, xy_b = a[~glass], xy_a[~glass], xy_b[~glass]
         found = initial_two_view(xy_a, xy_b, guess, self._focal_px, cfg.two_view_px)
         if found is None or found[1].sum() < max(cfg.min_fitting, cfg.min_fitting_fraction * len(a)):
-            return None
+            return corners, None
         step, _ = found
         length = driven_m = self._model.speed_mps * dt_s
         if driven_m <= 0.05:
@@ -297,7 +321,7 @@ class Odometry:
         self._window = KeyframeWindow(self._focal_px, cfg)
         self._window.append(frame, self._pose, reference.ids[a], xy_a)
         self._scale.restart(reference.image, self._pose, 0.2 if driven_m > 0.05 else 1.0)
-        return self._pose @ Pose(step.R, step.p * length), _TWO_VIEW_INFORMATION
+        return corners, (self._pose @ Pose(step.R, step.p * length), _TWO_VIEW_INFORMATION)
 
     # --- rolling shutter ---
 
@@ -342,6 +366,7 @@ class Odometry:
         )
         factor = self._scale.measure_scale(step, view)
         self._window.rescale(factor)
+        self._velocity_prior.rescale(factor)
         self._pose = pose
         return Pose(step.R, step.p * (factor * self._scale.motion_factor))
 
@@ -367,31 +392,39 @@ class Odometry:
             return car.proven and car.is_moving(MOVING_M)
         return not self._scale.unknown and self._model.speed_mps > _MOVING_MPS
 
+    def _doubt_one_part(self, corners: Corners, pose: Pose, info: Floats) -> Floats:
+        """The pose's information (6, 6), less where one part of the image, maybe a vehicle, alone gives the length."""
+        inflation = self.config.motion.covariance_inflation
+        off, sigmas = length_without_a_part(self._window, corners, self._pose, pose, inflation)
+        if sigmas < _ONE_PART_SIGMAS:
+            return info
+        step = pose.R.T @ (pose.p - self._pose.p)
+        along = np.concatenate([step / float(np.linalg.norm(step)), np.zeros(3)])
+        # Sherman-Morrison: (P + along along^T off^2 / inflation)^-1
+        by_along = info @ along
+        return info - np.outer(by_along, by_along) / (inflation / off**2 + float(along @ by_along))
+
     def _apply_velocity_prior(self, pose: Pose, info: Floats, dt_s: float) -> tuple[Pose, Floats, float]:
         """The pose, its information (6, 6), and 1-sigma of its position where the velocity prior gave it, else inf."""
-        inflation, prior = self.config.motion.covariance_inflation, self._velocity_prior
-        stated = info / inflation
-        fused = None
-        if self._model.known:
-            fused = prior.fuse(self._pose, pose, self._pose @ self._model.predict(dt_s), stated, dt_s)
+        inflation = self.config.motion.covariance_inflation
+        fused = self._velocity_prior.fuse(self._pose, pose, info / inflation, dt_s, self._scale.ground)
         if fused is None:
-            prior.update(largest_sigma_m(stated + np.eye(6) * 1e-3), dt_s)
             return pose, info, np.inf
         pose, sigma_m = fused
-        prior.update(sigma_m, dt_s)
         return pose, info + np.diag([inflation / sigma_m**2] * 3 + [0.0] * 3), sigma_m
 
     def _move(self, frame_id: int, step: Pose, cov6: Floats, dt_s: float, displacement_px: Floats) -> Motion:
         length_m = float(np.linalg.norm(step.p))
         over_s, earlier_m = self._standing.moved(displacement_px, length_m, dt_s)
         self._model.update(step, dt_s, over_s)
+        self._velocity_prior.update(planar(step, self._scale.ground), over_s)
         return self._records.measured(self._frames(frame_id), step, cov6, self._obstructed, dt_s, earlier_m)
 
     def _stand(self, frame_id: int, dt_s: float) -> Motion:
         unseen_m = self._standing.stood(dt_s)
         if not unseen_m:
             self._model.stop()
-            self._velocity_prior.update(0.0, 1.0)
+            self._velocity_prior.stop()
         return self._records.standing(self._frames(frame_id), unseen_m)
 
     def _coast(self, frame_id: int, dt_s: float, status: list[Status], car: CarMotion | None) -> Motion:

@@ -34,6 +34,7 @@ GERMAN, AMERICAN = (18.0, 6.0), (12.2, 3.05)  # a dashed line's period and dash
 RAIL_M, RAIL_HIGH_M = 4.0, 0.75  # a guard rail's piece
 POST_EVERY_M = 50.0  # posts beside a road
 EGO_M = 30.0  # where the ego begins
+QUEUE_M, LIGHT_M = 14.0, 45.0  # from there: the vehicle ahead in a queue, and the light that it brakes for
 NIGHT_GREY = 1.0  # cd/m^2: of the road ten metres ahead in its own beams such a camera makes a light grey
 _BEYOND_M = 280.0  # of road behind the last place of a drive
 _ACROSS = 0.75  # of a bend's radius: no further aside is there ground
@@ -137,6 +138,20 @@ def built_up(seed: int, kind: str, speed_mps: float, grade: float = 0.0) -> Scen
     movers = tuple(settle(populate(rng, street, EGO_M, lane.d_m, 300.0), street))
     ego = Mover(draw_shape(rng, "estate"), EGO_M, lane.d_m, 0.0, speed_mps, speed_mps, lane.d_m)
     return Scenario(street, standing, movers, ego, _sunny(), _camera(), seed, AXLE_M)
+
+
+def queue(seed: int, kind: str, speed_mps: float, ahead: str, red_s: float = 6.0) -> Scenario:
+    """A drawn street; a vehicle close ahead of the ego brakes with it for a red light, others drive beside them.
+
+    `ahead` is the vehicle's shape, or "truck"; the light is red until `red_s`.
+    """
+    street = built_up(seed, kind, speed_mps)
+    rng = np.random.default_rng([seed, 10])
+    own_d_m, red = street.ego.d_m, ((EGO_M + LIGHT_M, red_s),)
+    body = draw_truck(rng) if ahead == "truck" else draw_shape(rng, ahead)
+    front = Mover(body, EGO_M + QUEUE_M, own_d_m, 0.0, speed_mps, speed_mps, own_d_m, stops=red)
+    others = [m for m in street.movers if abs(m.d_m - own_d_m) > 1.5 or abs(m.s_m - EGO_M) > 70.0]
+    return replace(street, movers=(front, *others), ego=replace(street.ego, stops=red))
 
 
 def _road(course: Course, forth: int, back: int, surface: _Surface) -> Street:
@@ -270,5 +285,15 @@ ROADS: dict[str, Road] = {
     ),
     "town": Road("a street of a town with parked cars, 10 m/s", lambda: built_up(11, "urban", 10.0), 10.0),
     "avenue": Road("an avenue of a town, 13 m/s", lambda: built_up(12, "avenue", 13.0), 10.0),
+    "queue_avenue": Road(
+        "behind a van that brakes for a red light, from 14 m/s; trucks beside",
+        lambda: queue(75, "avenue", 14.0, "van"), 10.0, 70,
+    ),
+    "queue_street": Road("the same behind a car, from 10 m/s", lambda: queue(76, "urban", 10.0, "suv"), 10.0, 70),
+    "queue_sedan": Road("the same, from 13 m/s", lambda: queue(82, "avenue", 13.0, "sedan"), 10.0, 70),
+    "queue_truck": Road(
+        "behind a truck that hides the road, until both stand, from 12 m/s",
+        lambda: queue(94, "urban", 12.0, "truck", 10.0), 10.0, 110,
+    ),
     "hills": Road("a country road up and down at 6 %, 16 m/s", lambda: built_up(13, "country", 16.0, 0.06), 10.0),
 }  # fmt: skip

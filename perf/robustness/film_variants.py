@@ -14,6 +14,7 @@ from msgspec.structs import replace
 
 from birdslam.geometry.arrays import Image
 from birdslam.geometry.camera import Camera
+from birdslam.world.windscreen import from_share
 
 Timed = tuple[int, Image]  # t_source_ns, the raw image
 Change = Callable[[int, Image], Image]  # of an image's index and the image
@@ -30,6 +31,7 @@ class Variant:
     size: float = 1.0
     every: int = 1  # each n-th image alone
     repeats: int = 1  # how often each image comes, as films of another rate have it
+    interlaced: bool = False  # every second row is that of the film's next image
     crf: int | None = None  # of H.264: 18 is fine, 35 coarse
     shown: Change | None = None
 
@@ -55,8 +57,11 @@ class Variant:
 
     def images(self, film: Iterator[Timed], folder: Path) -> Iterator[Timed]:
         """The film's images so changed; `folder` takes what is encoded."""
+        yield from _encoded(self._repeated(self._resized(_woven(film) if self.interlaced else film)), self.crf, folder)
+
+    def _repeated(self, film: Iterator[Timed]) -> Iterator[Timed]:
         before: Timed | None = None
-        for t_ns, image in _encoded(self._resized(film), self.crf, folder):
+        for t_ns, image in film:
             if before is not None:  # each repetition between an image and the next
                 for repeat in range(1, self.repeats):
                     yield before[0] + repeat * (t_ns - before[0]) // self.repeats, before[1]
@@ -79,6 +84,8 @@ class Variant:
 PARTS = ("starts", "sizes", "noise", "compression", "view")
 _SIZES, _EVERY = (1.0, 0.5, 0.75, 2.0), (1, 2, 3)
 _NOISE_GREY, _DRAWS = 1.5, 5  # 1-sigma: no eye sees it
+_USUAL_CRF = 23
+_DIRT_SEED = 1
 
 
 def variants(camera: Camera, part: str) -> list[Variant]:
@@ -91,8 +98,11 @@ def variants(camera: Camera, part: str) -> list[Variant]:
         "view": [
             Variant("unchanged"),
             Variant("each image twice", repeats=2),
+            Variant("each image twice, H.264", repeats=2, crf=_USUAL_CRF),
+            Variant("interlaced, every 2 images", every=2, interlaced=True),
             Variant("caption", shown=_caption),
             Variant("bonnet", shown=_bonnet),
+            Variant("dirt", shown=_dirt()),
             Variant("flicker", shown=_flicker),
         ],
     }[part]
@@ -102,6 +112,17 @@ def variants(camera: Camera, part: str) -> list[Variant]:
 def _other(size: float, every: int) -> Variant:
     parts = [f"{size:g} of the size"] * (size != 1.0) + [f"every {every} images"] * (every != 1)
     return Variant(", ".join(parts) or "unchanged", size=size, every=every)
+
+
+def _woven(film: Iterator[Timed]) -> Iterator[Timed]:
+    """Half images of two times in each, as interlaced cameras store them; the last image is left over."""
+    first: Timed | None = None
+    for t_ns, image in film:
+        if first is not None:
+            both = first[1].copy()
+            both[1::2] = image[1::2]
+            yield first[0], both
+        first = t_ns, image
 
 
 def _encoded(film: Iterator[Timed], crf: int | None, folder: Path) -> Iterator[Timed]:
@@ -153,6 +174,12 @@ def _caption(index: int, image: Image) -> Image:
     at = round(0.01 * columns), round(0.985 * rows)
     cv2.putText(out, text, at, cv2.FONT_HERSHEY_PLAIN, columns / 900.0, (235, 235, 235), max(1, columns // 700))
     return out
+
+
+def _dirt() -> Change:
+    """Spots on the windscreen, each time the same."""
+    edit = from_share("dirt", _DIRT_SEED, 0.0)
+    return lambda index, image: edit(index, 1, image)
 
 
 def _bonnet(_: int, image: Image) -> Image:

@@ -310,13 +310,16 @@ class RoadScale:
             return 1.0
         fit, searched, prior_cov = found
         known = confirmation.known or self._car.measures
-        expected = searched != 1.0 or not known or filter_.innovation(fit)[2] < cfg.max_innovation_sigma
         least = cfg.min_correlation
         told = fit.length_information > cfg.doubt_sigma_rel**-2  # far likelier than other lengths
         log_length = float(np.log(searched)) + float(fit.state[0])
-        found_before = searched != 1.0 and confirmation.found_before(log_length)
-        if told or found_before or agrees(log_length, by_landmarks):
+        confirmed = (searched != 1.0 and confirmation.found_before(log_length)) or agrees(log_length, by_landmarks)
+        if told or confirmed:
             least *= _AGREED_CORRELATION_SHARE
+        if searched == 1.0:
+            expected = not known or filter_.innovation(fit)[2] < cfg.max_innovation_sigma
+        else:
+            expected = confirmed or confirmation.may_be(log_length)
         if fit.correlation < least or not expected:
             confirmation.reject(new, log_length if searched != 1.0 else None)
             return 1.0

@@ -73,6 +73,13 @@ class ScaleConfirmation:
         agree = [log for log in self._found if log is not None and abs(log - log_length) < _SAME_LOG]
         return len(agree) >= _FOUND
 
+    def may_be(self, log_length: float) -> bool:
+        """Whether a search may have found this length in the present unit.
+
+        One search in many finds any by chance: a known length gives way to another one that was found before.
+        """
+        return not self.known or abs(log_length) < _SAME_LOG or self.found_before(log_length)
+
     def mean_information(self, information: float) -> float:
         """The mean of what comparisons tell with this one: by chance a single one may look like information."""
         self._mean += (information - self._mean) / min(self._comparisons + 1, _COMPARISONS)

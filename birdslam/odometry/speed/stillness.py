@@ -142,7 +142,10 @@ class NearRoadStillness:
         if changes is None:
             return False
         long, short, contrast = changes
-        return long < cfg.growth * max(short, _ROUNDING_GREY) and long < cfg.contrast_share * contrast
+        most = cfg.contrast_share * contrast
+        # What noise alone changes counts for nothing, but no more of it than `most`: on a road of grain all is noise
+        noise = min(short, self._noise_of_cells(), most)
+        return long < cfg.growth * max(short, _ROUNDING_GREY) and long**2 - noise**2 < most**2
 
 
 def _change(then: _Sample, now: _Sample) -> float | None:
