@@ -4,9 +4,8 @@
 
 KITTI's tracking sequences with their recorded boxes (RRC); the height is 1.65 m, and the estimate begins at 1.35 m. The
 tracker follows the boxes, by the true motion; the tilt is that of the direction of travel, as `birdslam calibrate` has
-it. A row is a sequence; sequences with fewer than five vehicles give none. The last of them is over all: the root mean
-square of the errors, and chi2 of them by their own sigmas (1: honest), with the sequence left out that is worst. With
-networks further rows have what `calibrate` finds on images by the width of lanes.
+it. Sequences with fewer than five vehicles give no row. `all`: the RMS of the errors, and chi2 of them by their own
+sigmas (1: honest), also without the worst. With networks further rows have the height by the width of lanes on images.
 """
 
 from __future__ import annotations
