@@ -146,7 +146,7 @@ class FrontEnd:
 
         motion, cc = self._move(frame, tracks, perception)  # scale-unambiguous ego-motion initialisation
         cv, vv = self._localise_vehicles(frame, motion, perception)  # dynamic object localisation
-        status += self.height.update(cv, motion)
+        status += self.height.update(cv, motion, frame.t_source_ns * 1e-9)
         cp = self._map_road(frame)  # static map initialisation
         lanes = self._map_lanes(frame, perception)  # lanes (Sec. 3.2)
 

@@ -25,9 +25,11 @@ from birdslam.calibration.calibration import (
 )
 from birdslam.calibration.height_check import HeightCheck, VehicleHeightConfig, solve_mounting
 from birdslam.calibration.intrinsics import from_chessboard, read_intrinsics
+from birdslam.calibration.lane_width import LaneWidth, checks_by_lanes, painted_width_m
 from birdslam.calibration.readout import USUAL
 from birdslam.frontend import FrontEndConfig
 from birdslam.geometry.camera import Camera
+from birdslam.lanes.ego_lane import EgoLane
 from birdslam.odometry.road.fit import RoadFit
 from birdslam.outputs.plain_words import DriveCounts, LengthsBy, verdict
 from birdslam.perception import Perception, Ready
@@ -36,7 +38,7 @@ from birdslam.runtime.cli.main import main
 from birdslam.sources.camera_file import camera_text, load_camera
 from birdslam.sources.recording import DatasetError
 from birdslam.sources.speed_file import read_speed_curve
-from birdslam.types import Frame
+from birdslam.types import Frame, LaneLine, LineKind
 from birdslam.vehicles.camera_height import BoxHeight
 from tests.test_odometry import CAMERA, PITCH_RAD, render, street
 
@@ -219,7 +221,7 @@ def test_the_stand_by_vehicles_is_within_its_sigma(seed: int) -> None:
     wide = np.diag([1.0, 0.1**2, 0.1**2])
     mounting = solve_mounting(boxes, np.array([1.65, 0.0, 0.0]), wide, VehicleHeightConfig())
     assert mounting is not None
-    assert np.sqrt(np.diag(mounting.cov)) == pytest.approx([0.08, 0.004, 0.05], rel=0.4)
+    assert np.sqrt(np.diag(mounting.cov)) == pytest.approx([0.11, 0.006, 0.05], rel=0.4)
     assert (np.abs(mounting.state - truth) < 2.5 * np.sqrt(np.diag(mounting.cov))).all()
     assert solve_mounting(boxes[:16], np.array([1.65, 0.0, 0.0]), wide, VehicleHeightConfig()) is None
 
@@ -238,6 +240,27 @@ def test_vehicles_on_a_bank_do_not_pass_for_a_roll_that_is_surely_known(seed: in
     mounting = solve_mounting(boxes, np.array([1.4, 0.0, 0.0]), np.diag([0.4, 0.01, 0.01]), VehicleHeightConfig())
     assert mounting is not None
     assert (np.abs(mounting.state - truth) < 2.5 * np.sqrt(np.diag(mounting.cov))).all()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_two_cars_that_pass_slowly_do_not_outvote_those_ahead(seed: int) -> None:
+    """Their boxes err alike: as they pass, the lower edge moves by 0.07 of the bearing, for 15 s at 30 Hz."""
+    rng, truth_m = np.random.default_rng(seed), 1.35
+    boxes = []
+    for vehicle in range(10):
+        z, tall_m = rng.uniform(15, 40), rng.normal(1.53, 0.08)
+        for _ in range(10):
+            bottom = truth_m / z + rng.normal(0, 0.002)
+            boxes.append(BoxHeight(vehicle, bottom, 0.002, tall_m / z, 0.002, rng.uniform(-0.1, 0.1), 1.53, 0.08))
+    for vehicle in (10, 11):
+        for z in np.linspace(5.0, 12.0, 450):
+            b = 3.5 / z
+            bottom = truth_m / z + 0.07 * (b - 0.5) + rng.normal(0, 0.002)
+            boxes.append(BoxHeight(vehicle, bottom, 0.002, 1.53 / z, 0.002, b, 1.53, 0.08))
+    mounting = solve_mounting(boxes, np.array([1.5, 0.0, 0.0]), np.diag([0.5, 2e-5, 1e-4]), VehicleHeightConfig())
+    assert mounting is not None
+    assert abs(mounting.state[0] - truth_m) < 1.5 * np.sqrt(mounting.cov[0, 0])
+    assert abs(mounting.state[2]) < 0.03
 
 
 def test_an_error_of_the_running_scale_is_in_what_the_road_says_however_many_comparisons_there_are() -> None:
@@ -403,6 +426,41 @@ def test_a_stated_height_that_cars_contradict_is_kept_with_a_sigma_that_covers_b
     )
     assert (agreed.scale_sigma_rel, by.contradicted_by) == (0.0, "")
     assert not any("contradicted" in said for said in verdict(counts(lengths_by(agreed, by, None))))
+
+
+def test_without_a_height_cars_and_lanes_give_it_together_and_what_they_differ_by_widens_it() -> None:
+    cars = HeightCheck(cue="vehicles", height_m=1.2, sigma_m=0.06, samples=12)
+    lanes = HeightCheck(cue="lanes", height_m=1.3, sigma_m=0.15, samples=300)
+    camera, by = with_height(calibrated(1.5, (cars, lanes)), False, None, "video:town.mp4")
+    assert 1.2 < camera.height_m < 1.3
+    assert "12 cars and the width of lanes" in by.words
+    alone, _ = with_height(calibrated(1.5, (cars,)), False, None, "video:town.mp4")
+    assert camera.scale_sigma_rel < alone.scale_sigma_rel
+    far = msgspec.structs.replace(lanes, height_m=1.9)
+    assert with_height(calibrated(1.5, (cars, far)), False, None, "video:f")[0].scale_sigma_rel > alone.scale_sigma_rel
+
+
+@pytest.mark.parametrize("height_m", [0.9, 1.35, 2.2])
+def test_the_height_by_painted_lanes(height_m: float) -> None:
+    """Seen at 1.5 m, lanes of 3.5 m look narrower or wider in proportion."""
+    rng = np.random.default_rng(3)
+    seen = [LaneWidth(1.5 / height_m * rng.normal(3.5, 0.1), 0.4) for _ in range(200)]
+    (check,) = checks_by_lanes(seen, 1.5, 0.004)
+    assert abs(check.height_m - height_m) < check.sigma_m
+    assert 0.1 < check.sigma_m / check.height_m < 0.15
+    assert checks_by_lanes(seen[:40], 1.5, 0.004) == []
+
+
+def test_a_lane_shows_its_width_where_paint_bounds_it_on_both_sides() -> None:
+    left, right, kerb = (
+        LaneLine(line=k, offset_m=y, slope=0.0, curvature_per_m=0.0, curvature_rate_per_m2=0.0, seen_from_m=5.0,
+                 cov=tuple((np.eye(4) * 1e-4).ravel()), seen_to_m=30.0, to_m=40.0, kind=kind)
+        for k, y, kind in ((1, 1.9, LineKind.SOLID), (2, -1.6, LineKind.DASHED), (3, -1.6, LineKind.EDGE))
+    )  # fmt: skip
+    assert painted_width_m(EgoLane().lanes((left, right), 0)) == pytest.approx(3.5)
+    assert painted_width_m(EgoLane().lanes((left, kerb), 0)) is None
+    assert painted_width_m(EgoLane().lanes((left,), 0)) is None
+    assert painted_width_m(None) is None
 
 
 def counts(rests_on: LengthsBy) -> DriveCounts:

@@ -22,3 +22,13 @@ def test_drawn_dashcams_have_lenses_that_fold_no_image() -> None:
         if not camera.fisheye:  # out to the corner, the radius in the image grows with that of the ray
             r = np.linspace(0.0, np.tan(np.radians(0.5 * drawn.dashcam.fov_deg)) * np.hypot(1.0, 9.0 / 16.0), 50)
             assert (np.diff(r * (1.0 + camera.distortion[0] * r**2)) > 0.0).all()
+
+
+def test_a_loose_mount_swings_as_far_as_it_says() -> None:
+    from birdslam.world.dashcam import Dashcam  # needs numba
+
+    loose, at_s = Dashcam(tremble_rad=0.01, tremble_hz=10.0), np.linspace(0.0, 0.1, 101)
+    pitch, roll = np.array([loose.trembled(t) for t in at_s]).T
+    assert np.abs(pitch).max() == pytest.approx(0.01, rel=1e-3)
+    assert np.abs(roll).max() == pytest.approx(0.005, rel=1e-2)
+    assert Dashcam().trembled(0.03) == (0.0, 0.0)

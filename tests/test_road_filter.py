@@ -211,24 +211,3 @@ def test_a_known_length_gives_way_to_another_that_two_searches_found_before() ->
     assert confirmation.may_be(0.3)
     assert not confirmation.may_be(-0.3)
     assert confirmation.may_be(0.05)  # it is the known one
-
-
-@pytest.mark.parametrize("with_car", [False, True])
-def test_what_was_told_by_no_road_is_forgotten_with_the_tilt_that_it_bent(with_car: bool) -> None:
-    """A bonnet taken for road: tilt and curvature are the camera file's again, known as at the begin."""
-    begun, filter_ = (RoadFilter(CAMERA, RoadScaleConfig()) for _ in range(2))
-    if with_car:
-        filter_.add_car_states()
-    for _ in range(20):
-        filter_.predict(np.eye(3), 0.4)
-        filter_.update_alignment(
-            RoadFit(np.array([0.1, -0.05, 0.02, 0.001]), np.diag([0.02, 0.01, 0.01, 5e-4]) ** 2, 0.9, 1000)
-        )
-    assert abs(filter_.tilt[0]) > 0.02
-    states = len(begun.x)
-    car = filter_.cov[states:, states:].copy()
-    filter_.forget_road()
-    np.testing.assert_array_equal(filter_.x[:states], begun.x)
-    np.testing.assert_array_equal(filter_.cov[:states, :states], begun.cov)
-    np.testing.assert_array_equal(filter_.cov[states:, states:], car)
-    assert not filter_.cov[:states, states:].any()

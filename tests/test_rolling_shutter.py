@@ -15,6 +15,7 @@ from birdslam.calibration.readout import USUAL, readout_of_drive
 from birdslam.geometry.camera import Camera, Undistorter
 from birdslam.geometry.pose import Pose
 from birdslam.geometry.rolling_shutter import RollingShutter
+from birdslam.odometry.motion import uneven_cov
 from birdslam.odometry.odometry import Odometry
 from birdslam.odometry.road.alignment import RoadAlignConfig, RoadAligner
 from birdslam.odometry.road.fit import RoadFit
@@ -165,3 +166,14 @@ def test_a_camera_file_states_it(tmp_path: Path) -> None:
     path.write_text(camera_text(CAMERA, ()).replace("readout_s = 0.03", "readout_s = 30"))
     with pytest.raises(DatasetError, match="readout_s"):
         load_camera(path)
+
+
+def test_a_turn_that_changes_while_rows_are_read_is_known_the_less() -> None:
+    """A firm mount's sigma is as it was; one that swings by half a degree at 10 Hz turns otherwise in each image."""
+    cov6 = np.diag([1e-4] * 3 + [1e-7] * 3)
+    swings_radps = np.array([0.5, 0.0, 0.2])
+    np.testing.assert_array_equal(uneven_cov(cov6, 0.0, swings_radps), cov6)
+    np.testing.assert_array_equal(uneven_cov(cov6, 0.03, np.zeros(3)), cov6)
+    wider = uneven_cov(cov6, 0.03, swings_radps)
+    np.testing.assert_array_equal(wider[:3, :3], cov6[:3, :3])
+    assert (np.sqrt(np.diag(wider)[3:]) > 1e-3).all()

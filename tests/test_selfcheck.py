@@ -251,9 +251,8 @@ def _watched(
             noise = rng.normal(0.0, 1.0, 4)
             box = (columns[0] + noise[0], rows[0] + noise[1], columns[1] + noise[2], rows[1] + noise[3])
             frame = 6 * vehicle + k
-            told.append(
-                bool(watch.update([_edge(vehicle, frame, box)], _motion(frame, camera, tilt_error_rad, *status)))
-            )
+            motion = _motion(frame, camera, tilt_error_rad, *status)
+            told.append(bool(watch.update([_edge(vehicle, frame, box)], motion, 0.1 * frame)))
     return watch, told
 
 
@@ -262,7 +261,7 @@ def test_the_height_by_the_vehicles(wrong: float) -> None:
     watch, told = _watched(wrong * 1.65)
     ratio, sigma_rel, vehicles = watch.estimate
     assert vehicles == 40
-    assert 0.03 < sigma_rel < 0.06
+    assert 0.04 < sigma_rel < 0.07
     assert abs(math.log(ratio / wrong)) < 2.0 * sigma_rel
     assert told[-1] == (wrong != 1.0)
     assert not any(told[: 6 * 7])  # seven vehicles are no evidence

@@ -26,6 +26,7 @@ from birdslam.calibration.height_check import (
     checks_by_vehicles,
     solve_mounting,
 )
+from birdslam.calibration.lane_width import LaneWidth, checks_by_lanes, painted_width_m
 from birdslam.frontend import FrontEnd, FrontEndConfig, Pending
 from birdslam.geometry.camera import Camera, plane_normal
 from birdslam.odometry.motion import Motion
@@ -117,6 +118,7 @@ class Observations:
     lines: list[VanishingPoint] = field(default_factory=list)
     steps: list[Step] = field(default_factory=list)
     boxes: list[BoxHeight] = field(default_factory=list)
+    lanes: list[LaneWidth] = field(default_factory=list)
     times_ns: dict[int, int] = field(default_factory=dict)
     frames: int = 0
 
@@ -172,6 +174,7 @@ def calibrate(
         height_checks=(
             *checks_by_length(lengths or {}, seen.steps, seen.times_ns, camera, config.height),
             *checks_by_vehicles(seen.boxes, camera, cov, config.vehicles),
+            *checks_by_lanes(seen.lanes, camera.height_m, float(sigma[0])),
         ),
         yaw_rad=_yaw_rad(seen),
         path_m=seen.path_m,
@@ -194,6 +197,9 @@ def _observe(drive: Drive, camera: Camera, frontend: FrontEndConfig, config: Cal
             continue
         length = float(np.linalg.norm(motion.t_prev_curr_m))
         since_m += length
+        width_m = painted_width_m(measurements.road_lanes)
+        if width_m is not None:
+            seen.lanes.append(LaneWidth(width_m, length))
         if odometry.road_fit is not None:
             seen.fits.append((odometry.road_fit, since_m))
             since_m = 0.0

@@ -1,12 +1,13 @@
 """A check of the camera's height by independent knowledge.
 
 The metric scale of one camera is its height: the images alone can't tell whether it is right. What can is a speed or
-poses of the recording, or the sizes of vehicles (vehicles/camera_height.py measures them); each gives a height with its
-sigma. The vehicles give pitch and roll as well.
+poses of the recording, the sizes of vehicles (vehicles/camera_height.py measures them) or the width of lanes
+(lane_width.py); each gives a height with its sigma. The vehicles give pitch and roll as well.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated
@@ -16,9 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
-from birdslam.vehicles.camera_height import BoxHeight
+from birdslam.vehicles.camera_height import (
+    BANK_RAD,
+    STATES,
+    BoxHeight,
+    jacobian,
+    own_variance,
+    without_own_errors,
+)
 
-VEHICLES = "vehicles"  # the cue of their sizes
+VEHICLES, LANES = "vehicles", "lanes"  # the cues of their sizes
 Floats = NDArray[np.float64]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 Step = tuple[int, int, float]  # from frame, to frame, length as the odometry measured it
@@ -36,13 +44,11 @@ class VehicleHeightConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
     """The uncertainty of the camera's height by boxes of vehicles."""
 
     sigma_class_rel: Positive = 0.04  # of the mean height of a class on a country's roads, and of a detector's boxes
-    sigma_kerb_m: Positive = 0.06  # how far the road under a vehicle lies off the ego's plane
     sigma_bounce_rad: Positive = 0.008  # of the camera's pitch in one frame against its mean
     sigma_pitch_rad: Positive = 0.003  # of the mean: edges of boxes lie alike above the wheels' contact
     # Of the mean roll: those on one side stand on the same crown, kerb or bank. By as much as 0.011 to 0.014 rad it
     # differs from the road's own on KITTI 00, 0002 and 0005, by 0.05 in a street with a bank, by 0.12 in a hilly town
     sigma_crown_rad: Positive = 0.05
-    frames_alike: Positive = 5.0  # correlation time of a detector's errors, in frames
     gate_sigma: Positive = 3.0  # of a vehicle's residual; beyond it is left out
     min_vehicles: Annotated[int, msgspec.Meta(ge=2)] = 5
 
@@ -109,38 +115,40 @@ def solve_mounting(
     _, first = np.unique(table[:, 0], return_index=True)
     groups = np.split(table, first[1:])
     inlier = np.ones(len(groups), bool)
-    state = np.array(prior, dtype=np.float64)
-    cov = np.array(prior_cov, dtype=np.float64)
+    expected = np.append(prior, np.zeros(STATES - 3))
+    of_prior = np.diag(np.full(STATES, BANK_RAD**-2))
+    of_prior[:3, :3] = np.linalg.inv(prior_cov)
+    state = expected
     for _ in range(6):
-        info, right = np.linalg.inv(prior_cov), np.linalg.solve(prior_cov, prior)
-        normalised = np.zeros(len(groups))
-        for k, rows in enumerate(groups):
-            bottom, sigma_bottom, tall, sigma_tall, bearing, height_m, sigma_rel = rows[:, 1:].T
-            inverse_depth = tall / height_m  # 1 / z of a vehicle as tall as its class
-            J = np.column_stack([inverse_depth, -np.ones(len(rows)), bearing])
-            r = bottom - J @ state
-            variance = sigma_bottom**2 + (state[0] / height_m * sigma_tall) ** 2 + config.sigma_bounce_rad**2
-            variance = variance * min(config.frames_alike, len(rows))
-            # common to all boxes of the vehicle: its height and the road under it, both in proportion to 1 / z
-            common = np.hypot(state[0] * sigma_rel, config.sigma_kerb_m) * inverse_depth
-            weighted = J / variance[:, None]
-            weighted_common = common / variance
-            share = 1.0 / (1.0 + common @ weighted_common)  # Sherman-Morrison
-            Jc = J.T @ weighted_common
-            if inlier[k]:
-                info = info + J.T @ weighted - share * np.outer(Jc, Jc)
-                right = right + weighted.T @ bottom - share * Jc * (weighted_common @ bottom)
-            normalised[k] = np.median(r) / np.sqrt(np.median(variance) / min(len(rows), 4) + np.median(common) ** 2)
-        cov = np.linalg.inv(info)
-        state = cov @ right
+        equations = [_of_vehicle(rows, state, config) for rows in groups]
+        A, b, own, normalised = (np.array(part) for part in zip(*equations, strict=True))
+        information, right = without_own_errors(A, b, own)
+        cov = np.linalg.inv(of_prior + information[inlier].sum(axis=0))
+        state = cov @ (of_prior @ expected + right[inlier].sum(axis=0))
         inlier = np.abs(normalised) < config.gate_sigma
         if inlier.sum() < config.min_vehicles:
             return None
     # Where vehicles scatter more than their sigmas say, as on a hill, all are less sure (Birge's ratio)
+    state, cov = state[:3], cov[:3, :3]
     scatter = float(np.square(normalised[inlier]).sum()) / max(int(inlier.sum()) - len(state), 1)
     cov *= max(1.0, scatter)
     cov += np.diag(np.square([state[0] * config.sigma_class_rel, config.sigma_pitch_rad, config.sigma_crown_rad]))
     return Mounting(state, 0.5 * (cov + cov.T), int(inlier.sum()))
+
+
+def _of_vehicle(rows: Floats, state: Floats, config: VehicleHeightConfig) -> tuple[Floats, Floats, Floats, float]:
+    """Normal equations of one vehicle's boxes, (6, 6) and (6,), its own variances (2,), and its residual in sigmas."""
+    bottom, sigma_bottom, tall, sigma_tall, bearing, height_m, sigma_rel = rows[:, 1:].T
+    inverse_depth = tall / height_m  # 1 / z of a vehicle as tall as its class
+    J = jacobian(inverse_depth, bearing)
+    variance = sigma_bottom**2 + (state[0] / height_m * sigma_tall) ** 2 + config.sigma_bounce_rad**2
+    aside_m = np.median(bearing / inverse_depth)
+    (own,) = own_variance(float(state[0]), sigma_rel[:1], np.array([aside_m]))
+    residual = float(np.median(bottom - J[:, :STATES] @ state))
+    common = np.square(np.median(J[:, [0, -1]], axis=0)) @ own
+    sigma = math.sqrt(float(np.median(variance)) + float(common))
+    weighted = J / (variance[:, None] * len(rows))  # a vehicle's boxes err alike, and count as one
+    return J.T @ weighted, weighted.T @ bottom, own, residual / sigma
 
 
 def _by_length(

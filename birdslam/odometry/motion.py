@@ -20,6 +20,7 @@ Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 _MAX_SLIP = 0.25  # sideways over forwards: the camera may look 5 degrees aside, and a car drifts by as much
 _MAX_AHEAD_M = 2.5  # a bus's camera is so much farther in front of the rear axle than a passenger car's
 _SLIP_NOISE_M = 0.05  # error of the images in a near scene
+_UNEVEN_ROWS = 0.08  # of the image: how far the corners that tell a turn lie from its middle row
 
 
 class MotionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -104,6 +105,16 @@ def violates_nonholonomic(T_prev_curr: SE2, camera_ahead_m: float) -> bool:
 def step_cov(config: MotionConfig, info: Floats) -> Floats:
     """(6, 6) of the camera's step from its information, both of (translation, rotation) in its own axes."""
     return np.asarray(np.linalg.inv(info + np.eye(6) * 1e-3) * config.covariance_inflation, np.float64)
+
+
+def uneven_cov(cov6: Floats, readout_s: float, change_radps: Floats) -> Floats:
+    """(6, 6) of a camera's step whose rows are read over `readout_s`, while its turn changes by so much (3,) a second.
+
+    Rows are undone by the last turn, a constant one; by how much a mount that trembles turns in each row no image says.
+    """
+    out = cov6.copy()
+    out[range(3, 6), range(3, 6)] += (_UNEVEN_ROWS * readout_s) ** 2 * float(change_radps @ change_radps)
+    return out
 
 
 def measured_cov(

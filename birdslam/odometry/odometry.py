@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
-from birdslam.geometry.pose import Pose
+from birdslam.geometry.pose import Pose, rotation_log
 from birdslam.geometry.rolling_shutter import RollingShutter
 from birdslam.odometry.corners.feature_tracks import FeatureTracker, Tracks, predict_corners_px
 from birdslam.odometry.corners.group_jackknife import length_without_a_part
@@ -28,7 +28,7 @@ from birdslam.odometry.corners.selection import Corners, CornerSelector
 from birdslam.odometry.corners.sliding_window import match_ids
 from birdslam.odometry.corners.two_view import initial_two_view, on_glass
 from birdslam.odometry.metric_scale import MetricScale, RoadView
-from birdslam.odometry.motion import Motion, planar, step_cov, violates_nonholonomic
+from birdslam.odometry.motion import Motion, planar, step_cov, uneven_cov, violates_nonholonomic
 from birdslam.odometry.motion_model import NO_MOTION, MotionModel
 from birdslam.odometry.motion_records import MotionRecords
 from birdslam.odometry.odometry_config import OdometryConfig
@@ -243,6 +243,9 @@ class Odometry:
                 self._scale.speed_predicted(predicted_sigma_m / max(step_length, predicted_sigma_m))
             cov6 = step_cov(cfg.motion, info)
             metric_step = self._scale_to_metres(pose, cov6, tracks, boxes_px, road_mask, flow_px, interval_ns)
+            if self._shutter.readout_s and self._model.known:
+                change_radps = rotation_log(metric_step.R) / dt_s - self._model.rate[1]
+                cov6 = uneven_cov(cov6, self._shutter.readout_s, change_radps)
             motion = self._move(frame_id, metric_step, cov6, dt_s, corners.displacement_px)
             self._tracker.accept(tracks)
         self._reference_frame, self._reference_t_ns = frame_id, t_source_ns

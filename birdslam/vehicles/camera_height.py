@@ -5,7 +5,7 @@ The bottom of a box falls below the horizon by H / z (Eq. 1), its height is h / 
     slope of the bottom = (H / h) * height of the box - d_pitch + d_roll * bearing        (all at a depth of 1)
 
 which is linear in the camera's height H and in its tilt, with the vehicles' heights h known by class to some per cent.
-docs/vehicles.md has how well it is known.
+Ground bends lengthwise and may be another one far aside, as in a car park: each vehicle has errors of its own.
 """
 
 from __future__ import annotations
@@ -30,6 +30,16 @@ Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 UNRELIABLE_TILT = {Status.ODOMETRY_COASTING, Status.SCALE_CARRIED, Status.SCALE_INVALID, Status.GROUND_VIOLATED}
 ITERATIONS = 4
 _MIN_RATIO = 0.1
+# By how much the ground under a vehicle lies off the ego's plane: as in ParallaxConfig, and the curvature of roads
+# lengthwise as in MetricScaleConfig
+_KERB_M, _CROWN_RAD, _BANK_PER_M = 0.06, 0.007, 0.001  # in the ego's lane, in proportion to y, and to y^2
+_CURVATURE_PER_M = 0.0006
+# What stands beside the road on one side has a bank in common: by 0.05 rad in a street with one (docs/constants.md)
+BANK_RAD, _ROAD_HALF_WIDTH_M = 0.05, 6.0
+_LEAST_INVERSE_DEPTH = 1e-3  # 1/m
+_BOX_MEMORY_S = 0.5  # as in ParallaxConfig
+STATES = 5  # H, d_pitch, d_roll, bank at the left and at the right: the first columns of `jacobian`
+_OWN = [0, 5]  # its columns in which a vehicle has errors of its own
 
 
 class CameraHeightConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -39,8 +49,6 @@ class CameraHeightConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     sigma_pitch_rad: Positive = 0.004  # of the mean tilt by the images
     sigma_roll_rad: Positive = 0.01  # of the mean tilt by the images
     sigma_class_rel: Positive = 0.04  # of the mean height of a class on a country's roads, and of a detector's boxes
-    sigma_kerb_m: Positive = 0.06  # how far the road under a vehicle lies off the ego's plane
-    correlated_frames: Positive = 5.0  # so many frames in a row have the same error of detector and tilt
     gate_sigma: Positive = 1.5  # past it a vehicle is down-weighted (Huber)
     max_sigma_box_rel: Positive = 0.2  # a box that is known less well is left out
     max_vehicles: Annotated[int, msgspec.Meta(ge=2)] = 60  # the last so many
@@ -61,6 +69,34 @@ class BoxHeight:
     bearing: float
     height_m: float  # of its class
     sigma_height_rel: float
+
+
+def jacobian(inverse_depth: Floats, bearing: Floats) -> Floats:
+    """(N, 6) of the slopes of boxes' bottoms by `STATES`, and by the road's vertical curvature up to the vehicle."""
+    z = 1.0 / np.maximum(inverse_depth, _LEAST_INVERSE_DEPTH)
+    beyond = np.maximum(np.abs(bearing) - _ROAD_HALF_WIDTH_M * inverse_depth, 0.0)
+    banks = beyond * (bearing > 0.0), beyond * (bearing < 0.0)
+    return np.column_stack([inverse_depth, -np.ones(len(z)), bearing, *banks, 0.5 * z])
+
+
+def own_variance(camera_height_m: float, sigma_height_rel: Floats, aside_m: Floats) -> Floats:
+    """(N, 2) of vehicles' own errors: of H by their size and the ground under them (m^2), of the curvature (1/m^2)."""
+    below_m2 = _KERB_M**2 + np.square(_CROWN_RAD * aside_m) + np.square(_BANK_PER_M * np.square(aside_m))
+    of_height = np.square(camera_height_m * sigma_height_rel) + below_m2
+    return np.column_stack([of_height, np.full(len(of_height), _CURVATURE_PER_M**2)])
+
+
+def without_own_errors(information: Floats, right: Floats, variance: Floats) -> tuple[Floats, Floats]:
+    """Normal equations (N, 6, 6), (N, 6) of vehicles, of the `STATES` alone: (N, 5, 5), (N, 5).
+
+    `variance` (N, 2) is of errors that each vehicle has in all of its boxes, in the columns `_OWN`; they are
+    marginalised (Schur's complement).
+    """
+    across = information[:, :STATES, _OWN]
+    own = information[:, _OWN][:, :, _OWN] + np.eye(2) / variance[:, None, :]
+    share = across @ np.linalg.inv(own)
+    reduced = information[:, :STATES, :STATES] - share @ across.transpose(0, 2, 1)
+    return reduced, right[:, :STATES] - np.einsum("nij,nj->ni", share, right[:, _OWN])
 
 
 def measure_heights(edges: Sequence[VehicleEdge], camera: Camera, config: LocalisationConfig) -> list[BoxHeight]:
@@ -90,20 +126,23 @@ def measure_heights(edges: Sequence[VehicleEdge], camera: Camera, config: Locali
 
 @dataclass
 class _NormalEquations:
-    """The boxes of one vehicle as sums of normal equations, in (H, d_pitch, d_roll)."""
+    """The boxes of one vehicle as sums of normal equations, in the columns of `jacobian`."""
 
-    information: Floats  # (3, 3)
-    right: Floats  # (3,)
+    information: Floats  # (6, 6)
+    right: Floats  # (6,)
     boxes: int
+    samples: float  # independent ones: boxes within `_BOX_MEMORY_S` err alike
+    last_s: float
     class_rel: float
+    aside_m: float  # of its last box
 
 
 class CameraHeightEstimator:
     """update() with the CV edges of a frame and its motion; gives CALIBRATION_DRIFT when the height has changed.
 
     Robust least squares over the vehicles seen last, each of which is one sample: it is as wrong in all its boxes.
-    State: H (m), d_pitch, d_roll (rad). Measurements: the slope of the bottom and the height of each box. Read by the
-    front end, as a status; `estimate` gives the height itself.
+    State: H (m), d_pitch, d_roll, two banks (rad). Measurements: the slope of the bottom and the height of each box.
+    Read by the front end, as a status; `estimate` gives the height itself.
     """
 
     def __init__(self, camera: Camera, config: CameraHeightConfig, localisation: LocalisationConfig) -> None:
@@ -116,18 +155,18 @@ class CameraHeightEstimator:
         """(height over the calibrated one, its 1-sigma, vehicles)."""
         return self._estimate
 
-    def update(self, edges: Sequence[VehicleEdge], motion: Motion | None) -> tuple[Status, ...]:
-        """Edges of other frames than the motion's are passed over."""
+    def update(self, edges: Sequence[VehicleEdge], motion: Motion | None, t_s: float) -> tuple[Status, ...]:
+        """Edges of other frames than the motion's, which ends at `t_s`, are passed over."""
         if motion is not None and _tilt_is_measured(motion):
             here = [edge for edge in edges if edge.frame == motion.to_frame]
-            if sum(self._add(box, motion) for box in measure_heights(here, self.camera, self._localisation)):
+            if sum(self._add(box, motion, t_s) for box in measure_heights(here, self.camera, self._localisation)):
                 self._estimate = self._solve()
         ratio, sigma_rel, vehicles = self.estimate
         cfg = self.config
         drifted = abs(math.log(ratio)) > max(cfg.drift_rel, cfg.drift_sigma * sigma_rel)
         return (Status.CALIBRATION_DRIFT,) if vehicles >= cfg.min_vehicles and drifted else ()
 
-    def _add(self, box: BoxHeight, motion: Motion) -> bool:
+    def _add(self, box: BoxHeight, motion: Motion, t_s: float) -> bool:
         """Adds the box to the sums; False where it determines too little to be used."""
         cfg, ground = self.config, motion.ground
         slope = box.slope_bottom + ground.pitch_rad - ground.roll_rad * box.bearing
@@ -136,35 +175,38 @@ class CameraHeightEstimator:
         sigma_slope = math.hypot(box.sigma_bottom, motion.pitch_sigma_rad)
         if math.hypot(sigma_slope / slope, box.sigma_height / box.tan_height) > cfg.max_sigma_box_rel:
             return False
-        J = np.array([box.tan_height / box.height_m, -1.0, box.bearing])
+        inverse_depth = box.tan_height / box.height_m
+        (J,) = jacobian(np.array([inverse_depth]), np.array([box.bearing]))
         weight = 1.0 / (sigma_slope**2 + (self.camera.height_m / box.height_m * box.sigma_height) ** 2)
-        sums = self._vehicles.pop(box.vehicle, None) or _NormalEquations(np.zeros((3, 3)), np.zeros(3), 0, 0.0)
+        sums = self._vehicles.pop(box.vehicle, None) or _NormalEquations(
+            np.zeros((6, 6)), np.zeros(6), 0, 0.0, -math.inf, 0.0, 0.0
+        )
         sums.information += weight * np.outer(J, J)
         sums.right += weight * slope * J
-        sums.boxes, sums.class_rel = sums.boxes + 1, box.sigma_height_rel
+        sums.boxes, sums.samples = sums.boxes + 1, sums.samples + min(1.0, (t_s - sums.last_s) / _BOX_MEMORY_S)
+        sums.last_s, sums.class_rel, sums.aside_m = t_s, box.sigma_height_rel, box.bearing / inverse_depth
         self._vehicles[box.vehicle] = sums
         while len(self._vehicles) > cfg.max_vehicles:
             self._vehicles.popitem(last=False)
         return True
 
     def _solve(self) -> tuple[float, float, int]:
-        """Least squares over all vehicles, of which each has an error of its own in proportion to J[0] (Huber)."""
+        """Least squares over all vehicles, of which each has errors of its own (Huber)."""
         cfg, height_m, vehicles = self.config, self.camera.height_m, list(self._vehicles.values())
-        correlated = np.array([min(cfg.correlated_frames, sums.boxes) for sums in vehicles])
-        A = np.array([sums.information for sums in vehicles]) / correlated[:, None, None]
-        b = np.array([sums.right for sums in vehicles]) / correlated[:, None]
-        own = np.square(height_m * np.array([sums.class_rel for sums in vehicles])) + cfg.sigma_kerb_m**2
-        share = own / (1.0 + own * A[:, 0, 0])  # Sherman-Morrison
-        information = (A - share[:, None, None] * A[:, :, None, 0] * A[:, None, 0, :]).reshape(-1, 9)
-        right = b - (share * b[:, 0])[:, None] * A[:, 0]
-        spread = np.sqrt(A[:, 0, 0] * (1.0 + own * A[:, 0, 0]))
-        prior = np.diag(1.0 / np.square([cfg.sigma_height_rel * height_m, cfg.sigma_pitch_rad, cfg.sigma_roll_rad]))
-        expected = np.array([height_m, 0.0, 0.0])
+        alike = np.array([sums.boxes / sums.samples for sums in vehicles])
+        A = np.array([sums.information for sums in vehicles]) / alike[:, None, None]
+        b = np.array([sums.right for sums in vehicles]) / alike[:, None]
+        class_rel, aside_m = np.array([(sums.class_rel, sums.aside_m) for sums in vehicles]).T
+        information, right = without_own_errors(A, b, own_variance(height_m, class_rel, aside_m))
+        spread = A[:, 0, 0] / np.sqrt(information[:, 0, 0])
+        sigmas = cfg.sigma_height_rel * height_m, cfg.sigma_pitch_rad, cfg.sigma_roll_rad, BANK_RAD, BANK_RAD
+        prior, expected = np.diag(1.0 / np.square(sigmas)), np.append(height_m, np.zeros(STATES - 1))
         weight, x, cov = np.ones(len(vehicles)), expected, prior
         for _ in range(ITERATIONS):
-            cov = np.asarray(np.linalg.inv(prior + (weight @ information).reshape(3, 3)), dtype=np.float64)
+            total = prior + np.einsum("n,nij->ij", weight, information)
+            cov = np.asarray(np.linalg.inv(total), dtype=np.float64)
             x = cov @ (prior @ expected + weight @ right)
-            residual = np.abs(b[:, 0] - A[:, 0] @ x) / spread
+            residual = np.abs(b[:, 0] - A[:, 0, :STATES] @ x) / spread
             weight = 1.0 / np.maximum(1.0, residual / cfg.gate_sigma)
         ratio = max(float(x[0]) / height_m, _MIN_RATIO)
         return ratio, math.hypot(math.sqrt(float(cov[0, 0])) / (ratio * height_m), cfg.sigma_class_rel), len(vehicles)

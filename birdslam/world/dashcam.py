@@ -48,6 +48,8 @@ class Dashcam:
     pitch_rad: float = 0.0
     roll_rad: float = 0.0
     readout_s: float = 0.0  # from the first row to the last
+    tremble_rad: float = 0.0  # how far a loose mount swings up and down, and half as far about the axis of view
+    tremble_hz: float = 0.0
     exposure_s: float = 0.0  # of each row
     adapts_s: float = 0.0  # time constant of the exposure
     light: float = 1.0  # of a day's: with less of it the picture is grainier
@@ -74,6 +76,11 @@ class Dashcam:
             fisheye=self.fisheye,
             readout_s=self.readout_s,
         )
+
+    def trembled(self, t_s: float) -> tuple[float, float]:
+        """By how much pitch and roll differ then from those of a firm mount, rad."""
+        phase = 2.0 * math.pi * self.tremble_hz * t_s
+        return self.tremble_rad * math.sin(phase), 0.5 * self.tremble_rad * math.sin(phase + 1.0)
 
 
 DASHCAMS: dict[str, Dashcam] = {
@@ -114,6 +121,9 @@ def film(scenario: Scenario, dashcam: Dashcam, count: int, rate_hz: float) -> It
             T_now = _pose(now, dashcam.camera)
             T_before, steps = (T_now, 1.0) if before is None else (before, 2.0)
             motion = _twist(np.linalg.inv(T_before) @ T_after) * (rate_hz / steps)
+            before = T_now
+            now = _loose(now, dashcam)
+            T_now = _pose(now, dashcam.camera)
             light = optics.light(renderer, now, motion)
             grain = dashcam.light**-0.5
             lens = replace(
@@ -126,7 +136,6 @@ def film(scenario: Scenario, dashcam: Dashcam, count: int, rate_hz: float) -> It
             for edit in dashcam.glass:
                 image = edit(now.frame_id, count, image)
             yield FilmFrame(image, round(now.t_s * NS_PER_S), T_now, now.shaken(dashcam.camera))
-            before = T_now
         now = after
 
 
@@ -156,6 +165,12 @@ def _pose(moment: Moment, camera: Camera) -> Floats:
     T_ego_cam[:3, :3], T_ego_cam[:3, 3] = shaken.ground.R_ego_cam, (0.0, 0.0, shaken.height_m)
     out: Floats = moment.T_world_ego @ T_ego_cam
     return out
+
+
+def _loose(moment: Moment, dashcam: Dashcam) -> Moment:
+    """With the camera's own trembling in its mount beside how the body is shaken."""
+    (pitch, roll, heave), (up, about) = moment.shake, dashcam.trembled(moment.t_s)
+    return replace(moment, shake=(pitch + up, roll + about, heave))
 
 
 def _twist(T: Floats) -> Floats:
@@ -202,16 +217,17 @@ class _Optics:
             rendered.append((view, R_view_cam, seen.light, np.where(np.isinf(seen.depth_m), _SKY_M, seen.depth_m)))
         steps = _BLUR_STEPS if self._dashcam.exposure_s > 0.0 else 1
         blurred = [
-            self._seen(rendered, motion, ((k + 0.5) / steps - 0.5) * self._dashcam.exposure_s) for k in range(steps)
+            self._seen(rendered, motion, moment.t_s, ((k + 0.5) / steps - 0.5) * self._dashcam.exposure_s)
+            for k in range(steps)
         ]
         out: Floats32 = np.mean(blurred, axis=0, dtype=np.float32)
         return out
 
-    def _seen(self, rendered: list[Any], motion: Floats, late_s: float) -> Floats32:
+    def _seen(self, rendered: list[Any], motion: Floats, t_s: float, late_s: float) -> Floats32:
         """Each row at its own time: its rays are turned and moved to where the views were rendered from."""
         at_s = self._row_s + late_s
         moves = bool(self._dashcam.readout_s or late_s)
-        turned = _turned(self._rays, motion[:3], at_s) if moves else self._rays
+        turned = _turned(self._rays, self._turns(motion[:3], t_s, at_s[:, 0])) if moves else self._rays
         shift = at_s[..., None] * motion[3:]
         rays = turned
         for _ in range(3 if moves else 0):  # how far a ray's point is decides where it is seen from elsewhere
@@ -219,6 +235,15 @@ class _Optics:
             point = rays / np.linalg.norm(rays, axis=-1, keepdims=True) * range_m[..., None]
             rays = turned * np.linalg.norm(point - shift, axis=-1, keepdims=True) + shift
         return _looked_up(rendered, rays, depth=False)
+
+    def _turns(self, turn: Floats, t_s: float, at_s: Floats) -> Floats:
+        """(H, 3) how far the camera has turned at the time of each row (H,) about `t_s`, at `turn` (3,) a second."""
+        out = np.outer(at_s, turn)
+        if self._dashcam.tremble_rad:
+            now, then = self._dashcam.trembled(t_s), np.array([self._dashcam.trembled(t_s + t) for t in at_s])
+            out[:, 0] -= then[:, 0] - now[0]  # pitch is > 0 with the nose down: a turn about x to the right is < 0 then
+            out[:, 2] += then[:, 1] - now[1]
+        return out
 
 
 @dataclass(frozen=True)
@@ -267,9 +292,9 @@ def _rays(camera: Camera, px: Floats) -> Floats:
     return np.concatenate([d * by[..., None], np.cos(theta)[..., None]], axis=-1)
 
 
-def _turned(rays: Floats, turn: Floats, at_s: Floats) -> Floats:
-    """Rays at their own times in the axes of time 0; all of a row turn alike."""
-    return np.stack([row @ rotation_exp(turn * t).T for row, t in zip(rays, at_s[:, 0], strict=True)])
+def _turned(rays: Floats, turns: Floats) -> Floats:
+    """Rays at their own times in the axes of time 0, by the turn (H, 3) of each row."""
+    return np.stack([row @ rotation_exp(turn).T for row, turn in zip(rays, turns, strict=True)])
 
 
 def _looked_up(rendered: list[Any], rays: Floats, depth: bool) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,7 +11,7 @@ import msgspec
 import numpy as np
 
 from birdslam.calibration.calibration import Calibration, CalibrationError
-from birdslam.calibration.height_check import VEHICLES, HeightCheck, KnownLength
+from birdslam.calibration.height_check import LANES, VEHICLES, HeightCheck, KnownLength
 from birdslam.calibration.intrinsics import Intrinsics
 from birdslam.calibration.readout import Readout
 from birdslam.geometry.camera import Camera
@@ -26,6 +27,7 @@ COUNTRY_SIGMA_REL = 0.08
 # Where nothing shows the height: behind a car's windscreen, 1.1 to 1.6 m; by judgement
 WINDSCREEN_M, WINDSCREEN_SIGMA_REL = 1.35, 0.2
 AGREES_SIGMA = 2.0
+SIZES = (VEHICLES, LANES)  # cues that show the height alone; others show what height and focal length make together
 _SHUTTER_PER_M2 = 0.066  # by rendered films of one street, with 0, 15 and 30 ms (docs/constants.md)
 
 
@@ -55,13 +57,18 @@ def known_lengths(recording: Recording, speed_file: Path | None) -> dict[str, Kn
 
 
 class HeightBy(NamedTuple):
-    """Where the camera's height comes from; `check` is the cue that gave it, None where it was stated."""
+    """Where the camera's height comes from; `checks` are the cues that gave it, none where it was stated."""
 
     words: str
-    check: HeightCheck | None
+    checks: tuple[HeightCheck, ...]
     sigma_rel: float  # of all lengths along the road, by this height and the focal length
     contradicted_by: str = ""  # what says another height than the one that was stated, and which
     shutter_rel: float = 0.0  # 1-sigma of the same lengths by rows that are read in turn
+
+    @property
+    def a_length(self) -> bool:
+        """Whether a known length gave it, which holds height and focal length together."""
+        return any(check.cue not in SIZES for check in self.checks)
 
 
 def with_height(
@@ -77,8 +84,7 @@ def with_height(
         height_m, by = found.camera.height_m, _stated_height(found, focal_rel)
     else:
         height_m, by = _estimated_height(found, focal_rel)
-    held_together = by.check is not None and by.check.cue != VEHICLES  # by a known length, the shutter's share too
-    if readout is not None and not held_together:
+    if readout is not None and not by.a_length:  # a known length has the shutter's share in it
         rel = shutter_rel(found.camera, height_m, found.speed_mps, readout.sigma_s)
         by = by._replace(shutter_rel=rel)
     sigma_rel = min(math.hypot(by.sigma_rel, by.shutter_rel), 1.0)
@@ -97,7 +103,8 @@ def shutter_rel(camera: Camera, height_m: float, speed_mps: float, sigma_s: floa
     return _SHUTTER_PER_M2 * sigma_s * speed_mps * height_m * camera.fy_px / camera.height_px
 
 
-def _sigma_rel(check: HeightCheck) -> float:
+def check_sigma_rel(check: HeightCheck) -> float:
+    """1-sigma of a height, as a fraction, with how much cars differ from country to country."""
     return math.hypot(check.sigma_m / check.height_m, COUNTRY_SIGMA_REL * (check.cue == VEHICLES))
 
 
@@ -105,31 +112,46 @@ def _stated_height(found: Calibration, focal_rel: float) -> HeightBy:
     """The height as stated; where an estimate contradicts it, the largest difference is its sigma."""
 
     def away_sigma(check: HeightCheck) -> float:
-        return abs(math.log(check.height_m / found.camera.height_m)) / math.hypot(_sigma_rel(check), focal_rel)
+        return abs(math.log(check.height_m / found.camera.height_m)) / math.hypot(check_sigma_rel(check), focal_rel)
 
     check = max(found.height_checks, key=away_sigma, default=None)
     if check is None or away_sigma(check) < AGREES_SIGMA:
-        return HeightBy("as stated", None, focal_rel)
-    said = f"the size of {check.samples} cars" if check.cue == VEHICLES else f"the {check.cue}"
-    contradicted = f"{said} says {check.height_m:.2f} m +- {_sigma_rel(check):.0%}"
+        return HeightBy("as stated", (), focal_rel)
+    contradicted = f"{_said_by(check)} says {check.height_m:.2f} m +- {check_sigma_rel(check):.0%}"
     between_rel = abs(math.log(check.height_m / found.camera.height_m))
-    return HeightBy("as stated", None, math.hypot(focal_rel, between_rel), contradicted)
+    return HeightBy("as stated", (), math.hypot(focal_rel, between_rel), contradicted)
 
 
 def _estimated_height(found: Calibration, focal_rel: float) -> tuple[float, HeightBy]:
-    """By a known length, by the size of cars, or by where most cameras are mounted."""
-    sigmas = {check.cue: _sigma_rel(check) for check in found.height_checks}
-    check = min(found.height_checks, key=lambda check: sigmas[check.cue], default=None)
-    if check is None or sigmas[check.cue] > WINDSCREEN_SIGMA_REL:
+    """By a known length, by the size of cars and the width of lanes, or by where most cameras are mounted."""
+    lengths = [check for check in found.height_checks if check.cue not in SIZES]
+    checks = found.height_checks if not lengths else (min(lengths, key=check_sigma_rel),)
+    height_m, own_rel = _mean_height(checks) if checks else (WINDSCREEN_M, math.inf)
+    if own_rel > WINDSCREEN_SIGMA_REL:
         sigma_rel = math.hypot(WINDSCREEN_SIGMA_REL, focal_rel)
         words = f"of most windscreens, +- {WINDSCREEN_SIGMA_REL:.0%}, since nothing here tells it"
-        return WINDSCREEN_M, HeightBy(words, None, sigma_rel)
-    own_rel = sigmas[check.cue]
+        return WINDSCREEN_M, HeightBy(words, (), sigma_rel)
+    if lengths:  # a known length holds height and focal length together
+        by = HeightBy(f"by {checks[0].cue} along {found.path_m:.0f} m, +- {own_rel:.0%}", checks, own_rel)
+    else:
+        said = " and ".join(_said_by(check) for check in checks)
+        by = HeightBy(f"by {said}, +- {own_rel:.0%}", checks, math.hypot(own_rel, focal_rel))
+    return height_m, by
+
+
+def _mean_height(checks: Sequence[HeightCheck]) -> tuple[float, float]:
+    """(height_m, its 1-sigma as a fraction) by all; their disagreement widens it (Birge's ratio)."""
+    logs, sigmas = np.log([check.height_m for check in checks]), np.array([check_sigma_rel(check) for check in checks])
+    mean = float(np.average(logs, weights=sigmas**-2.0))
+    scatter = float(np.square((logs - mean) / sigmas).sum()) / max(1, len(checks) - 1)
+    return math.exp(mean), math.sqrt(max(1.0, scatter) / float((sigmas**-2.0).sum()))
+
+
+def _said_by(check: HeightCheck) -> str:
+    """What says a height, for people."""
     if check.cue == VEHICLES:
-        by = HeightBy(f"by the size of {check.samples} cars, +- {own_rel:.0%}", check, math.hypot(own_rel, focal_rel))
-    else:  # a known length holds height and focal length together
-        by = HeightBy(f"by {check.cue} along {found.path_m:.0f} m, +- {own_rel:.0%}", check, own_rel)
-    return check.height_m, by
+        return f"the size of {check.samples} cars"
+    return "the width of lanes" if check.cue == LANES else f"the {check.cue}"
 
 
 def focal_sigma_rel(lens: Intrinsics | None) -> float:
@@ -143,7 +165,7 @@ def lengths_by(camera: Camera, by: HeightBy, lens: Intrinsics | None, fov_deg: f
     """What the metres of a camera rest on, for people; `fov_deg` as the user states it."""
     words = f"the camera's height of {camera.height_m:.2f} m ({by.words})"
     focal_rel = focal_sigma_rel(lens)
-    if by.check is not None and by.check.cue != VEHICLES:  # a known length holds both together
+    if by.a_length:
         return LengthsBy(words, by.sigma_rel)
     if focal_rel:
         words += f" and its focal length of {camera.fx_px:.0f} px, +- {focal_rel:.0%}"

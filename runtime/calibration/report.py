@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from birdslam.calibration.intrinsics import Intrinsics
 from birdslam.calibration.readout import USUAL, Readout
 from birdslam.geometry.camera import Camera
 from birdslam.outputs.drive_files import ResultsError
-from birdslam.runtime.calibration.height import AGREES_SIGMA, HeightBy
+from birdslam.runtime.calibration.height import AGREES_SIGMA, HeightBy, check_sigma_rel
 from birdslam.sources.camera_file import camera_text
 
 
@@ -53,13 +54,14 @@ def report(
     if camera.scale_sigma_rel:
         yield f"all lengths +- {camera.scale_sigma_rel:.0%}, by all of these (scale_sigma_rel)"
     for check in found.height_checks:
-        if check is height_by.check:
+        if check in height_by.checks:
             continue
-        away = abs(check.height_m - camera.height_m) / check.sigma_m
+        sigma_rel = check_sigma_rel(check)
+        away = abs(math.log(check.height_m / camera.height_m)) / sigma_rel
         verdict = "agrees" if away < AGREES_SIGMA else f"DISAGREES ({away:.1f} sigma)"
-        yield f"  by {check.cue}: {check.height_m:.2f} +- {check.sigma_m:.2f} m (of {check.samples}): {verdict}"
+        yield f"  by {check.cue}: {check.height_m:.2f} m +- {sigma_rel:.0%} (of {check.samples}): {verdict}"
     if not found.height_checks:
-        yield "  not checked: neither poses nor a speed nor enough vehicles were there"
+        yield "  not checked: neither poses nor a speed nor enough vehicles or painted lanes were there"
 
 
 def _rows(readout: Readout, height_by: HeightBy, speed_mps: float) -> Iterator[str]:

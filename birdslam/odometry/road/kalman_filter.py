@@ -46,8 +46,13 @@ class RoadFilter:
     """
 
     def __init__(self, camera: Camera, config: RoadScaleConfig) -> None:
-        self.config, self._camera = config, camera
-        self.x, self.cov = _begun(camera, config)
+        self.config = config
+        self.x = np.array([0.0, camera.pitch_rad, camera.roll_rad, 0.0, camera.pitch_rad, camera.roll_rad, 0.0])
+        mount, tilt = config.sigma_mount_rad**2, config.sigma_mount_rad**2 + config.sigma_bounce_rad**2
+        self.cov: Floats = np.diag(
+            [1.0, tilt, tilt, config.sigma_curvature_per_m**2, mount, mount, config.scale_drift_per_m**2]
+        )
+        self.cov[[1, 2, 4, 5], [4, 5, 1, 2]] = mount
         self.pending_log = 0.0  # correction of log lambda that the caller has yet to apply
         # Travelled since the road has told the length, less the share that each alignment tells of it
         self.carried_m = 0.0
@@ -100,11 +105,6 @@ class RoadFilter:
         """The unit of length is known to `sigma_rel`, whatever it was: the window began anew, or it is doubted."""
         self.cov[0, :] = self.cov[:, 0] = 0.0
         self.cov[0, 0] = sigma_rel**2
-
-    def forget_road(self) -> None:
-        """What the alignments told is dropped, they were of no road: nothing but the camera file is known of it."""
-        self.cov[:STATES, :] = self.cov[:, :STATES] = 0.0
-        self.x[:STATES], self.cov[:STATES, :STATES] = _begun(self._camera, self.config)
 
     def inflate_scale(self, sigma_rel: float) -> None:
         """The unit of length is known to `sigma_rel` at best."""
@@ -289,12 +289,3 @@ class RoadFilter:
             self._update(np.array([-off]), H, np.array([[self.config.car.sigma_factor_rel**2]]))
         step, self.pending_log = self.pending_log - before, before
         return float(np.exp(np.clip(step, -4.0, 4.0)))
-
-
-def _begun(camera: Camera, config: RoadScaleConfig) -> tuple[Floats, Floats]:
-    """The states (STATES,) by the camera file alone, and their covariance."""
-    x = np.array([0.0, camera.pitch_rad, camera.roll_rad, 0.0, camera.pitch_rad, camera.roll_rad, 0.0])
-    mount, tilt = config.sigma_mount_rad**2, config.sigma_mount_rad**2 + config.sigma_bounce_rad**2
-    cov: Floats = np.diag([1.0, tilt, tilt, config.sigma_curvature_per_m**2, mount, mount, config.scale_drift_per_m**2])
-    cov[[1, 2, 4, 5], [4, 5, 1, 2]] = mount
-    return x, cov

@@ -210,12 +210,12 @@ class RoadScale:
             self.vanishing_point = found
 
     def _update_bonnet(self, view: RoadView, travelled_m: float) -> None:
-        """Where a bonnet has been taken for road until it was found, what it told is dropped."""
+        """Where a bonnet has been taken for road until it was found, scale and tilt are dropped."""
         driven_m = travelled_m if self._confirmation.begun else None
         if self._obstructions.bonnet_changed(view.grey, driven_m, view.flow_px):
-            self._filter.forget_road()
+            self._filter.reset_scale(1.0)
+            self._filter.lose_tilt()
             self._confirmation.forget()
-            self._was_known = False
 
     def _landmark_scale(self, window: SlidingWindow) -> float | None:
         """Metres in the window's unit of length by its landmarks on the road, where the scale is doubtful."""

@@ -1,0 +1,54 @@
+"""The camera's height by the width of lanes: that of a lane over the camera's height shows in any image of it.
+
+Neither the focal length nor the motion is in it. Lanes are 2.75 to 3.75 m wide, by country and road.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from birdslam.calibration.height_check import LANES, HeightCheck
+from birdslam.lanes.topology import AT_M, WIDTH_M, WIDTH_SIGMA_M
+from birdslam.types import Bound, Lanes
+
+LEAST_WAY_M = 20.0  # under painted lanes: less may be a turning lane, or a bay
+_ALIKE_M = 30.0  # a lane widens and narrows over some such way
+
+
+class LaneWidth(NamedTuple):
+    """The width of the ego's lane as one frame shows it (m, at the height that was assumed), and the way driven (m)."""
+
+    width_m: float
+    way_m: float
+
+
+def painted_width_m(lanes: Lanes | None) -> float | None:
+    """Of the ego's lane where paint bounds it on both sides, `AT_M` ahead."""
+    if lanes is None or lanes.ego_index is None:
+        return None
+    lane = lanes.lanes[lanes.ego_index]
+    if lane.left_bound is not Bound.PAINT or lane.right_bound is not Bound.PAINT:
+        return None
+    return lane.left_m(AT_M) - lane.right_m(AT_M)
+
+
+def checks_by_lanes(seen: Sequence[LaneWidth], camera_height_m: float, sigma_pitch_rad: float) -> list[HeightCheck]:
+    """One, or none where too little was seen of painted lanes. The widths were seen at `camera_height_m`."""
+    widths_m, ways_m = (np.array(part) for part in zip(*seen, strict=True)) if seen else (np.zeros(0), np.zeros(0))
+    way_m = float(ways_m.sum())
+    if way_m < LEAST_WAY_M:
+        return []
+    order = np.argsort(widths_m)
+    cumulated = np.cumsum(ways_m[order])
+    low, middle, high = widths_m[order][np.searchsorted(cumulated, np.array([0.16, 0.5, 0.84]) * way_m)]
+    height_m = camera_height_m * WIDTH_M / float(middle)
+    scatter_rel = 0.5 * float(high - low) / float(middle) / math.sqrt(max(1.0, way_m / _ALIKE_M))
+    pitch_rel = (
+        sigma_pitch_rad * AT_M / camera_height_m
+    )  # a point of the road at AT_M is seen H / AT_M below the horizon
+    sigma_rel = math.hypot(WIDTH_SIGMA_M / WIDTH_M, scatter_rel, pitch_rel)
+    return [HeightCheck(cue=LANES, height_m=height_m, sigma_m=height_m * sigma_rel, samples=len(seen))]
