@@ -66,13 +66,6 @@ def test_dirt_is_told_from_the_street_above_the_horizon_too() -> None:
     assert not found[-1][ids < 200].any()
 
 
-def test_the_street_that_moves_gives_the_way_where_no_length_is_known() -> None:
-    fixed_corners, found, ids = drive(4, 40, known=False)
-    assert fixed_corners.present
-    assert (found[-1] & (ids >= 200)).sum() >= 20  # those below the horizon at the least
-    assert not found[-1][ids < 100].any()
-
-
 def test_what_is_told_to_be_on_the_glass_is_fixed_until_it_moves() -> None:
     fixed_corners, px = FixedCorners(CAMERA, FixedCornersConfig()), np.full((20, 2), [300.0, 165.0])
     px[:, 0] += np.arange(20)
