@@ -228,8 +228,7 @@ class Odometry:
             pose, info, predicted_sigma_m = self._apply_velocity_prior(pose, info, dt_s)
             if vague and not self._velocity_prior.active:
                 # What the window has was placed by a speed that was hardly known
-                corners, anew = self._two_view_pose(corners, dt_s, car)
-                pose, info = anew or (pose, info)
+                pose, info = self._two_view_pose(corners, dt_s, car) or (pose, info)
             # Held steps err together, which is the unit of length: one beside another they are known better
             held_m = min(predicted_sigma_m, _HELD_SIGMA_REL * float(np.linalg.norm(pose.p - self._pose.p)))
             self._window.extend(
