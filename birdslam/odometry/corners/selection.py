@@ -58,7 +58,6 @@ class CornerSelector:
         """The corners of the present image; `driven_m` is the car's travel since the image before, None if unknown."""
         static = outside(tracks.px, boxes_px, is_night(tracks.image))
         ids, px = tracks.ids[static], tracks.px[static]
-        self._fixed_corners.begin(reference.ids, reference.px)
         fixed = self._fixed_corners.update(ids, px, ground, driven_m)
         inlier = self._below_plane.inliers(ids)
         ids, px, fixed = ids[inlier], px[inlier], fixed[inlier]

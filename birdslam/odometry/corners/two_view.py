@@ -3,8 +3,10 @@
 Where most corners are far away the essential matrix confuses rotation with sideways translation, and on wrong matches
 or on a moving car RANSAC finds a consensus on a motion that no car makes. From a prior near the truth, robust least
 squares on the same epipolar residuals has one minimum. The sign of the parallax along the epipolar line rejects what
-the epipolar distance does not see: a wrong match, a corner that moves along with the car. Corners that stand on the
-windscreen make a step sideways of a turn: the likelihood of both tells them from the street (`on_glass`).
+the epipolar distance does not see: a wrong match, or a corner that moves along with the car.
+
+Corners on the windscreen agree with one another on no motion, and half of them take a turn for a step sideways. What
+stands is told from the street by the likelihood of both: see `on_glass`.
 """
 
 from __future__ import annotations

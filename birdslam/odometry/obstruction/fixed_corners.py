@@ -2,8 +2,8 @@
 
 They agree perfectly with one another on no motion, and soon outvote the street. Below the horizon a corner of it
 must move at least as far as the road behind it, which the travelled distance gives. Above it dirt looks like what is
-far: there fixed corners are left out where enough below it are fixed. At a start that distance is not known: what moves
-below the horizon gives it, and the others' motion tells which stand (`corners/two_view.py`).
+far: there fixed corners are left out where enough below it are fixed. At a start that distance is not known: there the
+motion of the others tells which stand (`corners/two_view.py`), and those are fixed for as long as they stand.
 """
 
 from __future__ import annotations
@@ -30,8 +30,7 @@ class FixedCornersConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     with dirt, drops and reflections; on KITTI 00, 01, 06 and 0005 no corner is left out."""
 
     still_px: Positive = 1.0  # displacement of a corner that counts as moved
-    # Flow of the road behind a corner that is fixed: 20 sigma of a corner, since a start knows the way to a factor of 3
-    road_px: Positive = 6.0
+    road_px: Positive = 15.0  # flow of the road behind a corner that is fixed
     on_threshold: Count = 6  # fixed corners below the horizon
     on_threshold_share: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 0.15  # and their share of those below it
     judged_m: Positive = 2.0  # travel over which the road moves by road_px where corners count as below it
@@ -47,15 +46,9 @@ class FixedCorners:
         self._ids: Ints = np.zeros(0, np.int64)
         self._px: Floats = np.zeros((0, 2))
         self._since_m: Floats = np.zeros(0)
-        self._last_px: Floats = np.zeros((0, 2))  # in the last image
         self._path_m = 0.0
         self._told: Ints = np.zeros(0, np.int64)  # ids of those that another has found to be on the glass
         self.present = False
-
-    def begin(self, ids: Ints, px: Floats) -> None:
-        """Takes the corners of the image before the first of `update`, as it does."""
-        if not len(self._ids):
-            self._ids, self._px, self._since_m, self._last_px = ids, px, np.full(len(ids), self._path_m), px
 
     def tell(self, ids: Ints) -> None:
         """Takes corners of the present image, ids (N,), that are known to be on the glass."""
@@ -67,13 +60,13 @@ class FixedCorners:
         `driven_m` is the car's travel since the image before; None: it is not known.
         """
         cfg = self.config
-        before, now = match_ids(self._ids, ids)
-        self._path_m += self._way_m(px[now], self._last_px[before], ground) if driven_m is None else driven_m
+        self._path_m += driven_m or 0.0
         at_px, at_m = px.copy(), np.full(len(ids), self._path_m)
+        before, now = match_ids(self._ids, ids)
         unmoved = np.square(px[now] - self._px[before]).sum(axis=1) < cfg.still_px**2
         before, now = before[unmoved], now[unmoved]
         at_px[now], at_m[now] = self._px[before], self._since_m[before]
-        self._ids, self._px, self._since_m, self._last_px = ids, at_px, at_m, px.copy()
+        self._ids, self._px, self._since_m = ids, at_px, at_m
         path_m = self._path_m - at_m
         fixed = self._road_flow_px(px, ground, path_m) > cfg.road_px
         below = self._road_flow_px(px, ground, np.full(len(px), cfg.judged_m)) > cfg.road_px
@@ -84,19 +77,6 @@ class FixedCorners:
         if self.present:
             fixed |= self._road_flow_px(px, ground, path_m, 1.0 / cfg.far_m) > cfg.far_px
         return fixed
-
-    def _way_m(self, px: Floats, last_px: Floats, ground: GroundPlane) -> float:
-        """The way since the last image by corners (N, 2) in both: of those below the horizon that move, as of the road.
-
-        What stands above the road makes it longer, and corners that drops hold back shorter.
-        """
-        cfg = self.config
-        road_px = self._road_flow_px(px, ground, np.full(len(px), cfg.judged_m))
-        moved_px = np.hypot(*(px - last_px).T)
-        street = (road_px > cfg.road_px) & (moved_px > cfg.still_px)
-        if street.sum() < cfg.on_threshold:
-            return 0.0
-        return cfg.judged_m * float(moved_px[street].sum() / road_px[street].sum())
 
     def _road_flow_px(self, px: Floats, ground: GroundPlane, path_m: Floats, min_inverse_depth: float = 0.0) -> Floats:
         """(N,) optical flow of the road at pixels (N, 2) over distances (N,) straight ahead.
