@@ -66,17 +66,22 @@ def test_dirt_is_told_from_the_street_above_the_horizon_too() -> None:
     assert not found[-1][ids < 200].any()
 
 
-def test_what_is_told_to_be_on_the_glass_is_fixed_until_it_moves() -> None:
+def test_what_stands_is_told_by_the_streets_own_motion_where_no_length_is_known() -> None:
+    fixed_corners, found, ids = drive(3, 40, known=False)
+    assert fixed_corners.present
+    assert found[-1][ids >= 200].all()
+    assert not found[-1][ids < 100].any()
+
+
+def test_a_stretch_begins_anew_where_most_corners_were_lost() -> None:
     fixed_corners, px = FixedCorners(CAMERA, FixedCornersConfig()), np.full((20, 2), [300.0, 165.0])
     px[:, 0] += np.arange(20)
-    ids = np.arange(20)
-    assert not fixed_corners.update(ids, px, GROUND, None).any()
-    fixed_corners.tell(ids[:12])
-    assert fixed_corners.present
-    assert (fixed_corners.update(ids, px, GROUND, None) == (ids < 12)).all()
-    moved = px + [[0.0, 20.0]] * (ids >= 8)[:, None]
-    assert (fixed_corners.update(ids, moved, GROUND, None) == (ids < 8)).all()
-    assert (fixed_corners.update(ids, moved, GROUND, None) == (ids < 8)).all()
+    fixed_corners.begin(np.arange(20), px)
+    for first_id in (20, 40):
+        assert not fixed_corners.update(first_id + np.arange(20), px, GROUND, None).any()
+    moved = px + [[0.0, 20.0]] * (np.arange(20) < 8)[:, None]
+    fixed = fixed_corners.update(40 + np.arange(20), moved, GROUND, None)
+    assert (fixed == (np.arange(20) >= 8)).all()
 
 
 @pytest.mark.parametrize("known", [True, False])

@@ -26,7 +26,7 @@ from birdslam.odometry.corners.keyframes import KeyframeWindow
 from birdslam.odometry.corners.resection import InlierLimits, PoseEstimate, pose_without_fixed_corners
 from birdslam.odometry.corners.selection import Corners, CornerSelector
 from birdslam.odometry.corners.sliding_window import match_ids
-from birdslam.odometry.corners.two_view import initial_two_view, on_glass
+from birdslam.odometry.corners.two_view import initial_two_view
 from birdslam.odometry.metric_scale import MetricScale, RoadView
 from birdslam.odometry.motion import Motion, planar, step_cov, uneven_cov, violates_nonholonomic
 from birdslam.odometry.motion_model import NO_MOTION, MotionModel
@@ -284,30 +284,22 @@ class Odometry:
         corners, located = pose_without_fixed_corners(self._window, selected, self._pose, guesses, limits)
         self._obstructed = corners is not selected
         self._fixed = int(selected.fixed.sum())
-        return (corners, located) if located is not None else self._two_view_pose(corners, dt_s, car)
+        return corners, located if located is not None else self._two_view_pose(corners, dt_s, car)
 
-    def _two_view_pose(
-        self, corners: Corners, dt_s: float, car: CarMotion | None
-    ) -> tuple[Corners, PoseEstimate | None]:
-        """Starts the window anew from the reference image and this one; the corners used."""
+    def _two_view_pose(self, corners: Corners, dt_s: float, car: CarMotion | None) -> PoseEstimate | None:
+        """Starts the window anew from the reference image and this one."""
         cfg, reference = self.config, self._tracker.reference
         a, b = match_ids(reference.ids, corners.ids)
         if len(a) < cfg.min_fitting:
-            return corners, None
+            return None
         xy_a, xy_b = self.camera.to_xy(reference.px[a]), corners.xy[b]
         xy_a = self._at_middle(reference.ids[a], xy_a, self._pose)
         if self._seems_still(corners):
-            return corners, (self._pose, _TWO_VIEW_INFORMATION)
+            return self._pose, _TWO_VIEW_INFORMATION
         guess = self._searched if self._searched is not None else self._model.predict(dt_s)
-        glass = on_glass(xy_a, xy_b, guess, self._focal_px, cfg.two_view_px)
-        if glass.any():
-            told = np.isin(corners.ids, reference.ids[a[glass]])
-            corners = self._selector.tell_on_glass(corners, told, reference)
-            self._obstructed, self._fixed = True, self._fixed + int(glass.sum())
-            a, xy_a, xy_b = a[~glass], xy_a[~glass], xy_b[~glass]
         found = initial_two_view(xy_a, xy_b, guess, self._focal_px, cfg.two_view_px)
         if found is None or found[1].sum() < max(cfg.min_fitting, cfg.min_fitting_fraction * len(a)):
-            return corners, None
+            return None
         step, _ = found
         length = driven_m = self._model.speed_mps * dt_s
         if driven_m <= 0.05:
@@ -320,7 +312,7 @@ class Odometry:
         self._window = KeyframeWindow(self._focal_px, cfg)
         self._window.append(frame, self._pose, reference.ids[a], xy_a)
         self._scale.restart(reference.image, self._pose, 0.2 if driven_m > 0.05 else 1.0)
-        return corners, (self._pose @ Pose(step.R, step.p * length), _TWO_VIEW_INFORMATION)
+        return self._pose @ Pose(step.R, step.p * length), _TWO_VIEW_INFORMATION
 
     # --- rolling shutter ---
 

@@ -6,7 +6,7 @@ dirty, those fixed in the image (obstruction/fixed_corners.py).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,27 +58,17 @@ class CornerSelector:
         """The corners of the present image; `driven_m` is the car's travel since the image before, None if unknown."""
         static = outside(tracks.px, boxes_px, is_night(tracks.image))
         ids, px = tracks.ids[static], tracks.px[static]
+        self._fixed_corners.begin(reference.ids, reference.px)
         fixed = self._fixed_corners.update(ids, px, ground, driven_m)
         inlier = self._below_plane.inliers(ids)
         ids, px, fixed = ids[inlier], px[inlier], fixed[inlier]
         fixed &= self.obstructed
-        return Corners(ids, self._camera.to_xy(px), _displacement_px(reference, ids[~fixed], px[~fixed]), fixed)
-
-    def tell_on_glass(self, corners: Corners, on_glass: Bools, reference: Tracks) -> Corners:
-        """The corners without those that were found to be on the glass, (N,); they are left out while they stand."""
-        self._fixed_corners.tell(corners.ids[on_glass])
-        street = replace(corners, fixed=corners.fixed | on_glass).without_fixed()
-        moved_px = _displacement_px(reference, street.ids, self._camera.to_px(street.xy))
-        return replace(street, displacement_px=moved_px)
+        a, b = match_ids(reference.ids, ids)
+        a, b = a[~fixed[b]], b[~fixed[b]]
+        displacement: Floats = np.sqrt(((px[b] - reference.px[a]) ** 2).sum(axis=1))
+        return Corners(ids, self._camera.to_xy(px), displacement, fixed)
 
     def reject_below_plane(self, window: SlidingWindow, pose: Pose, ground: GroundPlane) -> None:
         """Rejects landmarks of the window, which is in metres; not behind a dirty windscreen, whose depths err."""
         if not self._fixed_corners.present:
             self._below_plane.update(window, pose, ground)
-
-
-def _displacement_px(reference: Tracks, ids: Ints, px: Floats) -> Floats:
-    """(M,) of those of the corners ids (N,), px (N, 2) that the reference image shows too."""
-    a, b = match_ids(reference.ids, ids)
-    out: Floats = np.sqrt(((px[b] - reference.px[a]) ** 2).sum(axis=1))
-    return out

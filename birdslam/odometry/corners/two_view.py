@@ -4,9 +4,6 @@ Where most corners are far away the essential matrix confuses rotation with side
 or on a moving car RANSAC finds a consensus on a motion that no car makes. From a prior near the truth, robust least
 squares on the same epipolar residuals has one minimum. The sign of the parallax along the epipolar line rejects what
 the epipolar distance does not see: a wrong match, or a corner that moves along with the car.
-
-Corners on the windscreen agree with one another on no motion, and half of them take a turn for a step sideways. What
-stands is told from the street by the likelihood of both: see `on_glass`.
 """
 
 from __future__ import annotations
@@ -30,14 +27,6 @@ _STEP_RAD = 1e-5  # of the numerical derivative
 # The forward part of a unit translation: 0.95 in a bend of 5 m radius, 1.7 m in front of the rear axle. Five points
 # found 0.68 on a ramp with one tree and guard rails (tests/roads/ramp_21_glare)
 _MIN_FORWARD = 0.87
-_FEWEST = 12  # corners of a two-view pose
-# 1-sigma of a tracked corner, measured: on drawn drops they move by 0.2 px in the median, beside the drops they lie 0.2
-# to 0.4 px off their true epipolar lines. Displacements and distances below are in it
-_CORNER_PX = 0.3
-_STANDS = 3.3  # a displacement with which a corner may stand: 99.6 % of those that do
-_OUTLIER = 5.0  # of a distance that no longer counts
-# Log likelihood ratios, doubled: Akaike's price of one more parameter, that a corner stands, and of the whole, e^5 to 1
-_PRICE, _DECISIVE = 2.0, 10.0
 
 
 def initial_two_view(
@@ -61,38 +50,6 @@ def initial_two_view(
     return from_prior if sideways or from_prior[1].sum() > 0.9 * five_point[1].sum() else five_point
 
 
-def on_glass(xy_a: Floats, xy_b: Floats, guess: Pose, focal_px: float, threshold_px: float) -> Bools:
-    """(N,) which of the pairs stand on the windscreen while the street moves; none where that is no likelier.
-
-    Two hypotheses: all N are of the street, with the motion that fits all; or those that stand may be on the glass,
-    which has no motion, with the motion that fits the others. Where the car drives straight on, what is far stands too,
-    fits the motion of the others and is of the street. Parameters as of `initial_two_view`.
-    """
-    none = np.zeros(len(xy_a), bool)
-    if len(xy_a) < 2 * _FEWEST:
-        return none
-    by_glass = np.square(focal_px / _CORNER_PX) * np.square(xy_b - xy_a).sum(axis=1)
-    stands = by_glass < _STANDS**2
-    if min(int(stands.sum()), int((~stands).sum())) < _FEWEST:
-        return none
-    of_all = initial_two_view(xy_a, xy_b, guess, focal_px, threshold_px)
-    of_street = initial_two_view(xy_a[~stands], xy_b[~stands], guess, focal_px, threshold_px)
-    if of_all is None or of_street is None:
-        return none
-    rays_a, rays_b = _rays(xy_a), _rays(xy_b)
-
-    def by_street(T_a_b: Pose) -> Floats:
-        off = np.abs(_residuals(T_a_b, rays_a, rays_b, focal_px)) / _CORNER_PX
-        off[_parallax_px(T_a_b, rays_a, rays_b, focal_px) < -threshold_px] = _OUTLIER
-        out: Floats = np.square(np.minimum(off, _OUTLIER))
-        return out
-
-    without = by_street(of_street[0])
-    told = stands & (by_glass + _PRICE < without)
-    gain = float(by_street(of_all[0]).sum() - np.where(told, by_glass + _PRICE, without).sum())
-    return told if gain > _DECISIVE else none
-
-
 def two_view_from_prior(
     xy_a: Floats, xy_b: Floats, guess: Pose, focal_px: float, threshold_px: float
 ) -> tuple[Pose, Bools] | None:
@@ -101,7 +58,7 @@ def two_view_from_prior(
     xy_a, xy_b (N, 2) are normalised coordinates. None where the guess has no translation, or there is no inlier.
     """
     length = float(np.linalg.norm(guess.p))
-    if len(xy_a) < _FEWEST or length < 1e-6:
+    if len(xy_a) < 12 or length < 1e-6:
         return None
     rays_a, rays_b = _rays(xy_a), _rays(xy_b)
     axes = _tangent_basis(guess.p / length)
@@ -131,7 +88,7 @@ def five_point_pose(xy_a: Floats, xy_b: Floats, focal_px: float, threshold_px: f
 
     None where the two views do not determine it.
     """
-    if len(xy_a) < _FEWEST:
+    if len(xy_a) < 12:
         return None
     cv2.setRNGSeed(1)
     E, mask = cv2.findEssentialMat(xy_a, xy_b, np.eye(3), cv2.USAC_MAGSAC, 0.999, threshold_px / focal_px, 500)

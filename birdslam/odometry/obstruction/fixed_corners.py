@@ -2,8 +2,9 @@
 
 They agree perfectly with one another on no motion, and soon outvote the street. Below the horizon a corner of it
 must move at least as far as the road behind it, which the travelled distance gives. Above it dirt looks like what is
-far: there fixed corners are left out where enough below it are fixed. At a start that distance is not known: there the
-motion of the others tells which stand (`corners/two_view.py`), and those are fixed for as long as they stand.
+far: there fixed corners are left out where enough below it are fixed. At a start that distance is not known, and a way
+by corners on drops fits no length of the road: where the street's corners below the horizon have moved far, those of
+all that stood are fixed.
 """
 
 from __future__ import annotations
@@ -17,12 +18,16 @@ from numpy.typing import NDArray
 from birdslam.geometry.bev import rays_cam
 from birdslam.geometry.camera import Camera, GroundPlane, plane_normal
 from birdslam.odometry.corners.sliding_window import match_ids
+from birdslam.odometry.median import quantile
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
+
+# Displacement of the street below the horizon, in the median of what moves there: then what stands is not the street
+_STRETCH_PX = 6.0
 
 
 class FixedCornersConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -38,6 +43,39 @@ class FixedCornersConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     far_px: Positive = 3.0  # flow at far_m of a corner that is fixed
 
 
+class _Stretch:
+    """The way over which the street's corners move by `_STRETCH_PX`: which others stand all along it.
+
+    State: the corners at its begin, and the ids of those that stood over the last one. Reader: `FixedCorners`.
+    """
+
+    def __init__(self, still_px: float, least: int) -> None:
+        self._still_px, self._least = still_px, least
+        self._ids: Ints = np.zeros(0, np.int64)
+        self._px: Floats = np.zeros((0, 2))
+        self.stood: Ints = np.zeros(0, np.int64)
+
+    def begin(self, ids: Ints, px: Floats) -> None:
+        """A new one from corners ids (N,) ascending, px (N, 2)."""
+        self._ids, self._px = ids, px
+
+    @property
+    def begun(self) -> bool:
+        """Whether there were corners to begin with."""
+        return len(self._ids) > 0
+
+    def update(self, ids: Ints, px: Floats, below: Bools) -> None:
+        """Takes the corners of the present image, as `begin`; `below` (N,) are those below the horizon."""
+        a, b = match_ids(self._ids, ids)
+        moved_px = np.hypot(*(px[b] - self._px[a]).T)
+        street = below[b] & (moved_px > self._still_px)
+        if street.sum() >= self._least and quantile(moved_px[street], 0.5) > _STRETCH_PX:
+            self.stood = ids[b][moved_px < self._still_px]
+            self.begin(ids, px)
+        elif 2 * len(a) <= len(self._ids):  # most were lost, or none were there
+            self.begin(ids, px)
+
+
 class FixedCorners:
     """State: each corner's position when it last moved, and the distance then. Reader: `CornerSelector`."""
 
@@ -47,12 +85,13 @@ class FixedCorners:
         self._px: Floats = np.zeros((0, 2))
         self._since_m: Floats = np.zeros(0)
         self._path_m = 0.0
-        self._told: Ints = np.zeros(0, np.int64)  # ids of those that another has found to be on the glass
+        self._stretch = _Stretch(config.still_px, config.on_threshold)
         self.present = False
 
-    def tell(self, ids: Ints) -> None:
-        """Takes corners of the present image, ids (N,), that are known to be on the glass."""
-        self._told, self.present = ids, True
+    def begin(self, ids: Ints, px: Floats) -> None:
+        """Takes the corners of the image before the first of `update`, as it does."""
+        if not self._stretch.begun:
+            self._stretch.begin(ids, px)
 
     def update(self, ids: Ints, px: Floats, ground: GroundPlane, driven_m: float | None) -> Bools:
         """(N,) which corners of the present image are fixed; ids (N,) ascending, px (N, 2).
@@ -70,12 +109,13 @@ class FixedCorners:
         path_m = self._path_m - at_m
         fixed = self._road_flow_px(px, ground, path_m) > cfg.road_px
         below = self._road_flow_px(px, ground, np.full(len(px), cfg.judged_m)) > cfg.road_px
-        self._told = np.intersect1d(self._told, ids[now])
-        fixed |= np.isin(ids, self._told)
+        self._stretch.update(ids, px, below)
+        stood = np.isin(ids, self._stretch.stood) & (driven_m is None)
+        fixed |= stood & below
         limit = max(cfg.on_threshold, cfg.on_threshold_share * int(below.sum())) * (0.5 if self.present else 1.0)
         self.present = int(fixed.sum()) >= limit
         if self.present:
-            fixed |= self._road_flow_px(px, ground, path_m, 1.0 / cfg.far_m) > cfg.far_px
+            fixed |= stood | (self._road_flow_px(px, ground, path_m, 1.0 / cfg.far_m) > cfg.far_px)
         return fixed
 
     def _road_flow_px(self, px: Floats, ground: GroundPlane, path_m: Floats, min_inverse_depth: float = 0.0) -> Floats:
