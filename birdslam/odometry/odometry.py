@@ -20,7 +20,6 @@ from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import Pose, rotation_log
 from birdslam.geometry.rolling_shutter import RollingShutter
 from birdslam.odometry.corners.feature_tracks import FeatureTracker, Tracks, predict_corners_px
-from birdslam.odometry.corners.group_jackknife import length_without_a_part
 from birdslam.odometry.corners.initialisation import MotionInitialiser
 from birdslam.odometry.corners.keyframes import KeyframeWindow
 from birdslam.odometry.corners.resection import InlierLimits, PoseEstimate, pose_without_fixed_corners
@@ -54,7 +53,6 @@ Bools = NDArray[np.bool_]
 _MIN_INTERVAL_S = 0.004
 _KNOWN_SCALE_SIGMA_REL = 0.3  # of a scale by which the travelled distance is used
 _MOVING_MPS = 3.0  # from one image to the next a car does not stop from this
-_ONE_PART_SIGMAS = 2.0  # by which a step is another one without a part of the image
 _HELD_SIGMA_REL = 0.1  # of a step at a held speed against the others of the window, at the most
 _TWO_VIEW_INFORMATION = np.diag([1e4] * 3 + [6e4] * 3)  # of a step by two images alone: 1 cm, 0.25 deg
 _NO_TRACKS = np.zeros(0, np.int64), np.zeros((0, 2))
@@ -223,7 +221,6 @@ class Odometry:
             # The pose is held, so this frame is as good a start of the next motion as the one that the car stopped in.
             motion = self._stand(frame_id, dt_s)
         else:
-            info = self._doubt_one_part(corners, pose, info)
             vague = self._velocity_prior.sigma_rel > cfg.road.invalid_sigma_rel
             pose, info, predicted_sigma_m = self._apply_velocity_prior(pose, info, dt_s)
             if vague and not self._velocity_prior.active:
@@ -382,18 +379,6 @@ class Odometry:
         if car is not None:
             return car.proven and car.is_moving(MOVING_M)
         return not self._scale.unknown and self._model.speed_mps > _MOVING_MPS
-
-    def _doubt_one_part(self, corners: Corners, pose: Pose, info: Floats) -> Floats:
-        """The pose's information (6, 6), less where one part of the image, maybe a vehicle, alone gives the length."""
-        inflation = self.config.motion.covariance_inflation
-        off, sigmas = length_without_a_part(self._window, corners, self._pose, pose, inflation)
-        if sigmas < _ONE_PART_SIGMAS:
-            return info
-        step = pose.R.T @ (pose.p - self._pose.p)
-        along = np.concatenate([step / float(np.linalg.norm(step)), np.zeros(3)])
-        # Sherman-Morrison: (P + along along^T off^2 / inflation)^-1
-        by_along = info @ along
-        return info - np.outer(by_along, by_along) / (inflation / off**2 + float(along @ by_along))
 
     def _apply_velocity_prior(self, pose: Pose, info: Floats, dt_s: float) -> tuple[Pose, Floats, float]:
         """The pose, its information (6, 6), and 1-sigma of its position where the velocity prior gave it, else inf."""

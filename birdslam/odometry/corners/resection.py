@@ -123,18 +123,6 @@ def resect(window: SlidingWindow, guess: Pose, ids: Ints, xy: Floats) -> tuple[P
     return pose, inliers, info
 
 
-def linearised(window: SlidingWindow, corners: Corners, pose: Pose) -> tuple[Floats, Floats, Floats, Floats]:
-    """Of the N landmarks in sight at `pose`: columns (N,) in the image (normalised), the Jacobian (6, 2, N) by the
-    pose, residuals (2, N) in px, and the robust weights (N,), 0 of outliers."""
-    at, known = _match_landmarks(window, corners.ids)
-    landmarks = _landmarks(window, at[known], corners.xy[known])
-    J = np.zeros((6, 2, len(landmarks.rho)))
-    r, variance, ahead = _linearise(window, landmarks, pose, J)
-    norm = np.sqrt((r[0] ** 2 + r[1] ** 2) / variance)
-    inlier = ahead & (norm < window.reject_px / window.sigma_px)
-    return landmarks.target[0], J, r, np.where(inlier, 1.0 / (np.maximum(1.0, norm / _HUBER_SIGMA) * variance), 0.0)
-
-
 def _match_landmarks(window: SlidingWindow, ids: Ints) -> tuple[Ints, Bools]:
     """(N,) index of each id's landmark in the window, and (N,) whether it is there with a known depth."""
     at = np.searchsorted(window.ids, ids)
