@@ -42,7 +42,7 @@ class ConstantVelocityConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=
     on_threshold: Positive = 2.0
     # ... until a step is known to the larger of these, which shows translation, however little the speed changes
     # between images at 33 Hz
-    least_sigma_m: Positive = 0.02  # (the shipped drive has 0.01, KITTI 06 at its night 0.1 and more)
+    least_sigma_m: Positive = 0.04  # (the shipped drive has 0.01, KITTI 06 at its night 0.1 and more)
     least_sigma_rel: Positive = 0.1  # of its length
     sigma_direction_rad: Positive = 0.02  # of the direction of travel
     heading_memory_m: Positive = 20.0  # over which the camera's heading against the car's way is learnt
