@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_other_odometry(parser, "FILE")
     add_detections(parser)
     add_topics(parser, "speed")
-    text = "the camera's height over the road, for a film without --camera; left out, the size of cars gives it"
+    text = "the camera's height over the road, for a film without --camera; left out, cars and lanes seen give it"
     parser.add_argument("--height", type=float, metavar="M", help=text)
     add_lens(parser)
     text = "fetch the networks that real roads want, once, without asking"
