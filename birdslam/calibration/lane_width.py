@@ -47,8 +47,6 @@ def checks_by_lanes(seen: Sequence[LaneWidth], camera_height_m: float, sigma_pit
     low, middle, high = widths_m[order][np.searchsorted(cumulated, np.array([0.16, 0.5, 0.84]) * way_m)]
     height_m = camera_height_m * WIDTH_M / float(middle)
     scatter_rel = 0.5 * float(high - low) / float(middle) / math.sqrt(max(1.0, way_m / _ALIKE_M))
-    pitch_rel = (
-        sigma_pitch_rad * AT_M / camera_height_m
-    )  # a point of the road at AT_M is seen H / AT_M below the horizon
+    pitch_rel = sigma_pitch_rad * AT_M / camera_height_m  # the road at AT_M is seen H / AT_M below the horizon
     sigma_rel = math.hypot(WIDTH_SIGMA_M / WIDTH_M, scatter_rel, pitch_rel)
     return [HeightCheck(cue=LANES, height_m=height_m, sigma_m=height_m * sigma_rel, samples=len(seen))]
