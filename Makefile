@@ -6,6 +6,7 @@ BIN := $(VENV)/bin
 TRAIN_VENV := .venv-train
 SITE_VENV := .venv-site
 DIST_VENV := .venv-dist
+TYPES := out/types
 DATA := $(or $(BIRDSLAM_DATA),../shared/data)
 MODELS := $(or $(BIRDSLAM_MODELS),../shared/models)
 
@@ -14,7 +15,7 @@ CORES := $(or $(shell nproc 2>/dev/null),2)
 unexport PYTHONDONTWRITEBYTECODE
 ON_EACH_CHANGE := not slow and not faults and not onroad
 
-.PHONY: setup browser test test-slow pythons wheel-test index-test pages wheels fuzz faults onroad perf lint train demo demo-kitti clean
+.PHONY: setup browser test test-slow pythons wheel-test index-test pages wheels fuzz faults onroad perf lint types train demo demo-kitti clean
 
 setup: $(VENV)/.ready
 
@@ -113,10 +114,15 @@ $(TRAIN_VENV)/.ready: pyproject.toml
 	$(TRAIN_VENV)/bin/python -m pip install --quiet --disable-pip-version-check -e '.[train]'
 	@touch $@
 
-lint: setup
+lint: setup types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
+
+# mypy sees the packages as they are installed, with runtime/ and perf/ inside birdslam/
+types: setup
+	rm -rf $(TYPES) && mkdir -p $(TYPES)/birdslam
+	ln -s $(CURDIR)/birdslam/* $(CURDIR)/runtime $(CURDIR)/perf $(TYPES)/birdslam/
+	cd $(TYPES) && $(CURDIR)/$(BIN)/mypy --config-file $(CURDIR)/pyproject.toml --cache-dir $(CURDIR)/.mypy_cache
 
 # The drive that ships with birdslam: the three processes at its 33 Hz, then how good it was, bev.png and drive.mp4
 demo: setup

@@ -50,7 +50,7 @@ new_release() {
     else # built from a copy: nothing of root's is left in the checkout
         package=$release/source
         mkdir "$package"
-        (cd "$source" && cp -R pyproject.toml README.md LICENSE birdslam runtime deploy configs "$package")
+        (cd "$source" && cp -R pyproject.toml setup.py README.md LICENSE birdslam runtime deploy configs "$package")
     fi
     "$release/bin/python" -m pip install --quiet --disable-pip-version-check "$package"
     rm -rf "$release/source"

@@ -1,4 +1,4 @@
-"""What installs the service on a vehicle computer, out of the package: deploy/install.sh needs no checkout."""
+"""Writes the files that install the service on a vehicle computer: deploy/install.sh needs no checkout."""
 
 from __future__ import annotations
 
@@ -6,26 +6,25 @@ import shutil
 from importlib.metadata import version
 from pathlib import Path
 
-import birdslam
 from birdslam.runtime.configuration import ConfigurationError
 
-PARTS = ("deploy", "configs/vehicle.toml")
-PACKAGE = "package"  # what install.sh hands to pip
+SOURCE = Path(__file__).resolve().parents[1]  # deploy/ and configs/ lie beside runtime/, in the checkout and installed
+PACKAGE = "package"  # the file that names what install.sh hands to pip
 
 
 def write_deployment(target: Path) -> Path:
-    """Writes the new folder `target`; gives its folder `deploy`. Raises ConfigurationError."""
+    """Writes the new folder `target` and returns its folder `deploy`. Raises ConfigurationError."""
     if target.exists():
-        raise ConfigurationError(f"{target}: is there already")
-    source = Path(birdslam.__file__).parent
+        raise ConfigurationError(f"{target}: exists already; name a new folder")
+    deploy, configs = target / "deploy", target / "configs"
     try:
-        for part in PARTS:
-            (target / part).parent.mkdir(parents=True, exist_ok=True)
-            if (source / part).is_dir():
-                shutil.copytree(source / part, target / part, ignore=shutil.ignore_patterns("__pycache__"))
-            else:
-                shutil.copy(source / part, target / part)
+        for folder in (deploy, configs):
+            folder.mkdir(parents=True)
+        for entry in (SOURCE / "deploy").iterdir():
+            if entry.is_file():
+                shutil.copy(entry, deploy)
+        shutil.copy(SOURCE / "configs" / "vehicle.toml", configs)
         (target / PACKAGE).write_text(f"birdslam=={version('birdslam')}\n", encoding="utf-8")
     except OSError as error:
         raise ConfigurationError(f"{error.filename or target}: {error.strerror}") from None
-    return target / "deploy"
+    return deploy

@@ -19,6 +19,13 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 FRAMES = 30
 LIMIT_S = 600.0
+FOLDERS = {
+    "birdslam": "birdslam",
+    "birdslam/runtime": "runtime",
+    "birdslam/perf": "perf",
+    "birdslam/deploy": "deploy",
+    "birdslam/configs": "configs",
+}
 NOT_PACKED = {".md", ".png", ".pyc", ".nbi", ".nbc"}  # pages and pictures of perf/, caches
 
 
@@ -38,14 +45,16 @@ def build(folder: Path) -> Path:
     return wheel
 
 
-def files_of(package: Path) -> set[str]:
-    """What the package consists of, by the links to runtime/ and perf/ too."""
-    found = (Path(folder, name) for folder, _, names in os.walk(package, followlinks=True) for name in names)
-    return {
-        path.relative_to(package.parent).as_posix()
-        for path in found
-        if path.suffix not in NOT_PACKED or path.parent.name == "deploy"
-    }
+def packaged_files() -> set[str]:
+    """The files of the checkout that the wheel contains, by their paths in site-packages."""
+    found = set()
+    for package, folder in FOLDERS.items():
+        for path in (ROOT / folder).rglob("*"):
+            inside = path.relative_to(ROOT / folder)
+            packed = path.is_file() and (path.suffix not in NOT_PACKED or folder == "deploy")
+            if packed and inside.parts[0] != "world" and "__pycache__" not in inside.parts:
+                found.add(f"{package}/{inside.as_posix()}")
+    return found
 
 
 def check_contents(wheel: Path) -> None:
@@ -54,7 +63,7 @@ def check_contents(wheel: Path) -> None:
         names = {name for name in archive.namelist() if not name.endswith("/")}
     _, version, *_ = wheel.name.split("-")
     assert {name.split("/")[0] for name in names} == {"birdslam", f"birdslam-{version}.dist-info"}
-    packed, expected = {name for name in names if name.startswith("birdslam/")}, files_of(ROOT / "birdslam")
+    packed, expected = {name for name in names if name.startswith("birdslam/")}, packaged_files()
     assert packed == expected, f"missing {sorted(expected - packed)}, too much {sorted(packed - expected)}"
 
 

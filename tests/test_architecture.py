@@ -25,7 +25,7 @@ MOST_LINES_OF_HEAD = 8
 
 
 def modules() -> dict[str, Path]:
-    """Every module by its full name, each once: birdslam/runtime and birdslam/perf are links."""
+    """Every module by its full name; setup.py maps the folders runtime/ and perf/ into the package."""
     found = {}
     for folder, name in FOLDERS.items():
         for path in sorted((ROOT / folder).rglob("*.py")):
