@@ -3,6 +3,8 @@ PYTHON ?= python3
 PYTHONS := 3.11 3.12 3.13
 VENV := .venv
 BIN := $(VENV)/bin
+PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check
+LOCK ?= requirements.lock
 TRAIN_VENV := .venv-train
 SITE_VENV := .venv-site
 DIST_VENV := .venv-dist
@@ -15,17 +17,29 @@ CORES := $(or $(shell nproc 2>/dev/null),2)
 unexport PYTHONDONTWRITEBYTECODE
 ON_EACH_CHANGE := not slow and not faults and not onroad
 
-.PHONY: setup browser test test-slow pythons wheel-test index-test pages wheels fuzz faults onroad perf lint types train demo demo-kitti clean
+.PHONY: setup lock newest browser test test-cpus test-cpus-sample test-slow pythons wheel-test index-test pages wheels fuzz faults onroad perf lint types train demo demo-kitti clean
 
 setup: $(VENV)/.ready
 
-$(VENV)/.ready: pyproject.toml
+$(VENV)/.ready: pyproject.toml setup.py $(LOCK)
+	@command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) is missing; as root: apt-get install python3-venv, or set PYTHON=..."; exit 1; }
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "birdslam needs Python 3.11 or newer; set PYTHON=..."; exit 1; }
 	@$(PYTHON) -c 'import ensurepip' 2>/dev/null || { test "$$(id -u)" = 0 && apt-get update -q && apt-get install -qy python3-venv; } \
 		|| { echo "Python's venv module is missing; as root: apt-get install python3-venv"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
+	@$(PIP) $(if $(LOCK),--require-hashes -r $(LOCK),-e '.[dev]') \
+		|| { echo "pip can't install $(or $(LOCK),the newest packages): is its index reachable? PIP_INDEX_URL names another"; exit 1; }
+	@$(PIP) --no-deps --no-build-isolation -e .
 	@touch $@
+
+# The versions that tests and CI install, with hashes for every platform, from the ranges in pyproject.toml
+lock: setup
+	$(PIP) uv
+	$(BIN)/uv pip compile --quiet --universal --generate-hashes --python-version 3.11 --extra dev pyproject.toml -o requirements.lock
+
+# `make test` with the newest versions that the ranges allow
+newest:
+	$(MAKE) --no-print-directory test LOCK= VENV=.venv-newest
 
 # For the tests of pages that a browser draws: Debian's, which root may install; without one they skip, and say so
 browser:
@@ -36,8 +50,15 @@ browser:
 
 # First the tests that compute, one on each core; then those that start processes and wait for them, three at a time
 test: browser setup
-	$(BIN)/python -m pytest -n $(CORES) --dist worksteal -m 'not processes and $(ON_EACH_CHANGE)'
-	$(BIN)/python -m pytest -n 3 --dist worksteal -m 'processes and $(ON_EACH_CHANGE)'
+	@$(BIN)/python -m tests.run
+
+# The tests that compute under the kernels of other processors, or VARIANT="NAME ..."; perf/accuracy/cpus.py lists them
+test-cpus: setup
+	@$(BIN)/python -m tests.run --cpus $(VARIANT)
+
+# Of that a sample, for CI
+test-cpus-sample: setup
+	@$(BIN)/python -m tests.run --sample
 
 # Then property tests with examples that are new each time
 test-slow: setup

@@ -24,6 +24,14 @@ ROOT = Path(__file__).resolve().parent.parent
 
 # As the nodes, and before any library is loaded: one thread for each, since tests run side by side
 os.environ.update(ENVIRONMENT, OPENCV_FOR_THREADS_NUM="1")
+if threads := os.environ.get("BIRDSLAM_TEST_THREADS"):  # a variant of `make test-cpus`
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
+    os.environ.update(dict.fromkeys(names, threads))
+
+if seed := os.environ.get("BIRDSLAM_ROUNDING"):
+    from tests.rounding import perturb_tracks
+
+    perturb_tracks(int(seed))
 
 # No time limits, since machines are shared. `make test` draws the same examples each time; `make test-slow` draws new
 # ones by the profile "explore", and prints how to repeat one that fails.

@@ -2,6 +2,7 @@
 
 import itertools
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,18 +12,15 @@ from birdslam.geometry.camera import Camera, Undistorter, plane_normal
 from birdslam.geometry.pose import Pose, rotation_exp
 from birdslam.odometry.corners.initialisation import InitialisationConfig, MotionInitialiser
 from birdslam.odometry.corners.two_view import initial_two_view, two_view_from_prior
-from birdslam.odometry.motion import Motion
 from birdslam.odometry.odometry import Odometry
 from birdslam.odometry.road.alignment import RoadAlignConfig, RoadAligner
 from birdslam.odometry.road.road_image import RoadImage
 from birdslam.odometry.road.scale_search import best_correlation, far_changed_pixels
-from birdslam.perf.accuracy.drives import Task, mirrored_camera, read
-from birdslam.perf.accuracy.overlays import measure
+from birdslam.perf.accuracy.drives import Task, errors, follow, read
 from birdslam.sources.opening import open_recording
-from birdslam.trajectory import as_poses
 from birdslam.types import Status
-from birdslam.world.windscreen import from_middle, from_share
-from tests.cases import first
+
+pytestmark = pytest.mark.numeric
 
 CAMERA = Camera(640, 240, 360.0, 360.0, 320.0, 100.0, height_m=1.5)
 RADIUS_M, TEXEL_M, WALL_TEXEL_M = 150.0, 0.1, 0.5
@@ -175,91 +173,60 @@ def test_of_a_road_of_one_row_nothing_is_farther() -> None:
 # --- on recorded drives ---
 
 
-def _ramp(
-    data_dir: Path, first: int, count: int, stride: int, mirrored: bool
-) -> tuple[Camera, list[np.ndarray], list[float]]:
-    """Images of KITTI 01, a ramp of 21 m radius from its first image on, and the true lengths between them."""
-    recording = open_recording(f"kitti:{data_dir / 'kitti_odometry' / 'sequences' / '01'}")
-    truth, images = as_poses(recording.truth_poses()), []
-    chosen = range(first, first + count * stride, stride)
-    for frame in recording.frames():
-        if frame.index in chosen:
-            image = frame.image if not mirrored else np.ascontiguousarray(frame.image[:, ::-1])
-            images.append(image)
-    steps = np.linalg.norm(np.diff(truth[list(chosen), :3, 3], axis=0), axis=1)
-    camera = recording.camera if not mirrored else mirrored_camera(recording.camera)
-    return camera, images, steps.tolist()
+START_IMAGES = 13
 
 
-@pytest.mark.parametrize(
-    ("begin", "stride", "mirrored"), first(2, [(0, 1, False), (10, 1, True), (0, 1, True), (0, 2, False)])
-)
-def test_a_cold_start_on_a_ramp(data_dir: Path, begin: int, stride: int, mirrored: bool) -> None:
-    camera, images, steps = _ramp(data_dir, begin, 12, stride, mirrored)
-    motions = _motions(camera, images, 0.1 * stride)
-    assert len(motions) == len(steps)
-    lengths = [float(np.linalg.norm(motion.t_prev_curr_m)) for motion in motions]
-    assert sum(lengths) == pytest.approx(sum(steps), rel=0.05)
-    for motion, length, step in zip(motions, lengths, steps, strict=True):
-        if Status.SCALE_INVALID not in motion.status:
-            assert length == pytest.approx(step, rel=0.1)
+def _starts(data_dir: Path, sequence: str, every: int, mirrored: bool) -> tuple[list[dict[str, Any]], int]:
+    """Cold starts of a KITTI sequence over START_IMAGES images each; how many motions they have in all."""
+    task = Task(f"kitti:{data_dir / 'kitti_odometry' / 'sequences' / sequence}", "", mirrored, 1, 1, 0, None)
+    drive, rows, motions = read(task)[1], [], 0
+    for begin in range(0, len(drive.images) - START_IMAGES, every):
+        over = range(begin, begin + START_IMAGES)
+        found = follow(drive, over)
+        row = errors(drive, over, *found)
+        assert row is not None
+        rows.append(row)
+        motions += len(found[1])
+    return rows, motions
 
 
-def _motions(camera: Camera, images: list[np.ndarray], interval_s: float) -> list[Motion]:
-    odometry = Odometry(camera)
-    found = [
-        odometry.estimate(odometry.track(image), k, round(k * interval_s * 1e9), NO_BOXES)
-        for k, image in enumerate(images)
-    ]
-    return [motion for motion in found if motion is not None]
+def test_cold_starts_on_real_roads_have_the_right_scale(data_dir: Path) -> None:
+    """Streets and a ramp of 21 m radius, as they are and mirrored; about 25 starts.
+
+    Over processors and perturbed tracks: median error 0.5 to 0.6 %, 83 % valid, 2 % of the motions wrong by a tenth while
+    valid.
+    """
+    rows, motions = [], 0
+    for sequence, every, mirrored in (("00", 20, False), ("01", 8, False), ("06", 8, False), ("01", 5, True)):
+        found, count = _starts(data_dir, sequence, every, mirrored)
+        rows, motions = rows + found, motions + count
+    assert len(rows) > 20
+    assert all(row["standstill"] == 0 for row in rows)
+    assert np.median([abs(row["scale_error"][-1]) for row in rows]) < 0.03
+    assert np.median([row["rotation_error_deg"][-1] for row in rows]) < 0.6
+    assert sum(row["valid"] for row in rows) >= 0.75 * motions
+    assert sum(len(row["wrong_valid"]) for row in rows) <= 0.05 * motions
 
 
-@pytest.mark.parametrize("pitch_deg", first(1, [0.0, 2.0]))
-def test_a_bare_motorway_behind_a_reflecting_windscreen(data_dir: Path, pitch_deg: float) -> None:
-    """25.4 m/s within 4 % by the dashes of the lane; the camera looks up by 0.95 degrees."""
+@pytest.mark.parametrize("pitch_deg", [0.0, 2.0])
+def test_a_wrong_pitch_of_the_camera_file_is_reported_on_a_bare_motorway(data_dir: Path, pitch_deg: float) -> None:
+    """The camera looks up by 0.95 degrees; reflections stand still on its windscreen."""
     path = data_dir / "highway" / "solidWhiteRight.mp4"
     if not path.is_file():
-        pytest.skip(f"{path}: not there")
+        pytest.skip(f"{path} is missing")
     # By the chessboards of camera_cal, scaled to the clip
     lens = (-0.2824, 0.1661, -0.0003, 0.0003, -0.2912)
     camera = Camera(
         960, 540, 871.2, 867.8, 506.3, 291.0, height_m=1.25, pitch_rad=np.radians(pitch_deg), distortion=lens
     )
     recording, undistort = open_recording(f"video:{path}", camera), Undistorter(camera)
-    images = [undistort(frame.image) for frame in itertools.islice(recording.frames(), 50)]
-    motions = _motions(camera, images, 0.04)
-    valid = [motion for motion in motions if Status.SCALE_INVALID not in motion.status]
-    assert len(valid) >= 0.9 * len(motions)
-    speeds_mps = np.array([np.linalg.norm(motion.t_prev_curr_m) / 0.04 for motion in valid])
-    assert np.abs(speeds_mps / 25.4 - 1.0).max() < 0.14  # the tenth that a valid speed may be off, and the dashes' 4 %
-    assert not any(motion.standstill for motion in motions)
-    assert Status.VIEW_OBSTRUCTED in motions[-1].status
-    assert np.degrees(motions[-1].ground.pitch_rad) == pytest.approx(-0.95, abs=0.6)
-    assert (Status.CALIBRATION_DRIFT in motions[-1].status) == (pitch_deg == 2.0)
-
-
-@pytest.mark.parametrize("kind", first(1, ["drops", "dirt", "reflection"]))
-def test_what_comes_to_stand_on_the_glass_is_no_standstill(data_dir: Path, kind: str) -> None:
-    task = Task(f"kitti:{data_dir / 'kitti_odometry' / 'sequences' / '06'}", "", False, 1, 1, 0, None)
-    name, drive = read(task, from_middle(kind, 1))
-    row = measure(drive)
-    assert name == "06"
-    assert row["standstill"] == row["wrong_valid"] == 0
-    assert row["valid"] >= 0.9 * row["frames"]
-    assert not np.array_equal(drive.images[-1], read(task)[1].images[-1])
-
-
-@pytest.mark.parametrize("name", ["kitti_tracking/training/image_02/0002", "kitti_odometry/sequences/00"])
-def test_rain_from_the_first_image_on_does_not_draw_the_way(data_dir: Path, name: str) -> None:
-    """Two corners of three are on drops; the way by all of them points aside, where no length fits the road."""
-    seed = 1 if name.endswith("0002") else 2
-    row = measure(
-        read(Task(f"kitti:{data_dir / name}", "", False, 1, 1, 0, None), from_share("rain", seed, 0.0))[1], 0.0
-    )
-    assert row["standstill"] == 0
-    assert row["valid"] >= 0.95 * row["frames"]
-    assert row["wrong_over_three"] <= row["wrong_valid_truth_doubtful"] <= 5  # of 00 as many without rain
-    assert abs(row["scale_error"]) < 0.04
+    odometry, motions = Odometry(camera), []
+    for k, frame in enumerate(itertools.islice(recording.frames(), 50)):
+        motions.append(odometry.estimate(odometry.track(undistort(frame.image)), k, k * 40_000_000, NO_BOXES))
+    seen = [motion for motion in motions if motion is not None]
+    assert not any(motion.standstill for motion in seen)
+    assert Status.VIEW_OBSTRUCTED in seen[-1].status
+    assert (Status.CALIBRATION_DRIFT in seen[-1].status) == (pitch_deg == 2.0)
 
 
 def test_a_road_sample_strip_bends_with_the_way() -> None:

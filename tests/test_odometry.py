@@ -26,6 +26,8 @@ from birdslam.sources.shipped_drive import DemoRecording
 from birdslam.types import Status
 from tests.cases import first
 
+pytestmark = pytest.mark.numeric
+
 WIDTH_PX, HEIGHT_PX = 620, 188
 CAMERA = Camera(WIDTH_PX, HEIGHT_PX, 360.0, 360.0, 305.0, 90.0, height_m=1.65)
 NO_BOXES = np.zeros((0, 4))
@@ -117,11 +119,12 @@ def drive(
     edit: Edit = lambda k, image: image,
     masks: Callable[[int], np.ndarray | None] = lambda k: None,
     boxes: Callable[[int], np.ndarray] = lambda k: NO_BOXES,
+    first: int = 0,
 ) -> tuple[dict[int, Pose], list[Motion]]:
     """Poses by frame, chained from the motions as a reader of them must (from_frame to to_frame), and the motions."""
     odometry, chained, motions = Odometry(CAMERA), {0: Pose(np.eye(3), np.zeros(3))}, []
     for k, pose in enumerate(poses):
-        image = edit(k, render(pose, k))
+        image = edit(k, render(pose, first + k))
         if image is None:
             continue
         tracks = odometry.track(image)
@@ -159,23 +162,34 @@ def straight() -> tuple[dict[int, Pose], list[Motion]]:
     return drive(street(STRAIGHT_10_HZ))
 
 
-@pytest.mark.parametrize("steps", [STRAIGHT_10_HZ, CURVE_10_HZ])
-def test_a_rendered_drive_has_its_length_its_course_and_the_cameras_pitch(steps: list[tuple[float, float]]) -> None:
-    truth = street(steps)
-    chained, motions = straight() if steps is STRAIGHT_10_HZ else drive(truth)
-    length = path_m(truth)
-    assert path_m(chained.values()) == pytest.approx(length, rel=0.04)
-    end = truth[0].between(truth[-1]).between(chained[len(steps)])
-    assert np.linalg.norm(end.p) < 0.04 * length
-    assert math.degrees(np.linalg.norm(rotation_log(end.R))) < 0.6
-    assert motions[-1].ground.pitch_rad == pytest.approx(PITCH_RAD, abs=math.radians(0.5))
-    assert motions[-1].status == ()
+FAST_33_HZ = [(0.22, 0.0)] * 50
 
 
-def test_33_hz_gives_the_same_road_as_10_hz() -> None:
-    truth = street([(0.22, 0.0)] * 50)
-    chained, _ = drive(truth, rate_hz=33.0)
-    assert path_m(chained.values()) == pytest.approx(path_m(truth), rel=0.03)
+@functools.cache
+def starts() -> list[tuple[Pose, float, Motion]]:
+    """Of 15 cold starts, five on each of three drives: the error of the last pose, the true length, the last motion."""
+    out = []
+    for steps, rate_hz in ((STRAIGHT_10_HZ, 10.0), (CURVE_10_HZ, 10.0), (FAST_33_HZ, 33.0)):
+        truth = street(steps)
+        for begin in range(5):
+            rest = truth[begin:]
+            chained, motions = drive(rest, rate_hz, first=begin)
+            error = rest[0].between(rest[-1]).between(chained[len(rest) - 1])
+            out.append((error, path_m(rest), motions[-1]))
+    return out
+
+
+def test_a_rendered_drive_has_its_length_and_its_course() -> None:
+    """Median over 15 starts: error of the last pose 0.4 % of the length, 0.10 degrees; spread below 0.01."""
+    assert np.median([np.linalg.norm(error.p) / length_m for error, length_m, _ in starts()]) < 0.03
+    assert np.median([math.degrees(np.linalg.norm(rotation_log(error.R))) for error, _, _ in starts()]) < 0.3
+
+
+def test_a_rendered_drive_gives_the_pitch_of_the_camera() -> None:
+    """Median over 15 starts: 0.05 to 0.06 degrees off."""
+    pitches = [motion.ground.pitch_rad for _, _, motion in starts()]
+    assert np.median(np.abs(np.array(pitches) - PITCH_RAD)) < math.radians(0.2)
+    assert all(motion.status == () for _, _, motion in starts())
 
 
 def test_the_motion_of_the_foot_is_planar() -> None:
@@ -466,45 +480,12 @@ def test_reset_starts_over_with_new_track_ids() -> None:
 # --- real clips ---
 
 
-def _real(path: Path, stride: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """Estimated and true camera poses, (N, 4, 4), without any network."""
-    recording = open_recording(f"kitti:{path}", stride=stride)
-    odometry, estimated = Odometry(recording.camera), [np.eye(4)]
+def test_the_ego_of_the_raw_clip_is_stationary_when_it_has_stopped(data_dir: Path) -> None:
+    recording = open_recording(f"kitti:{data_dir / 'kitti_raw_clip'}")
+    odometry, at = Odometry(recording.camera), {0: Pose(np.eye(3), np.zeros(3))}
     for k, frame in enumerate(recording.frames()):
         motion = odometry.estimate(odometry.track(frame.image), k, frame.t_source_ns, NO_BOXES, None)
         if motion is not None:
             check_sane(motion)
-            step = np.eye(4)
-            step[:3, :3], step[:3, 3] = motion.R_prev_curr, motion.t_prev_curr_m
-            estimated.append(estimated[motion.from_frame] @ step)
-    truth = recording.truth_poses()
-    assert truth is not None
-    truth = np.concatenate([truth, np.tile([[[0.0, 0.0, 0.0, 1.0]]], (len(truth), 1, 1))], axis=1)
-    return np.array(estimated), np.linalg.inv(truth[0]) @ truth
-
-
-def _figures(estimated: np.ndarray, truth: np.ndarray) -> tuple[float, float, float]:
-    """ATE over the path's length, signed scale error, and the root mean square turn error in degrees."""
-    length, own = (float(np.linalg.norm(np.diff(p[:, :3, 3], axis=0), axis=1).sum()) for p in (truth, estimated))
-    ate = float(np.sqrt(((estimated[:, :3, 3] - truth[:, :3, 3]) ** 2).sum(axis=1).mean()))
-    turns = [
-        np.linalg.norm(rotation_log((np.linalg.inv(a) @ b)[:3, :3].T @ (np.linalg.inv(c) @ d)[:3, :3]))
-        for a, b, c, d in zip(truth, truth[1:], estimated, estimated[1:], strict=False)
-    ]
-    return ate / length, own / length - 1.0, math.degrees(float(np.sqrt(np.mean(np.square(turns)))))
-
-
-@pytest.mark.parametrize(("sequence", "stride"), first(2, [("00", 1), ("06", 2), ("06", 1)]))
-def test_kitti_odometry(data_dir: Path, sequence: str, stride: int) -> None:
-    ate, scale, turn_deg = _figures(*_real(data_dir / "kitti_odometry" / "sequences" / sequence, stride))
-    assert ate < 0.025 * (1.5 if stride > 1 else 1.0)
-    assert abs(scale) < 0.03
-    assert turn_deg < 0.1 * 1.5 * stride
-
-
-def test_the_raw_clip_keeps_its_length_and_stands_still(data_dir: Path) -> None:
-    estimated, truth = _real(data_dir / "kitti_raw_clip")
-    own = np.linalg.norm(np.diff(estimated[:, :3, 3], axis=0), axis=1).sum()
-    assert own == pytest.approx(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum(), rel=0.10)
-    standing = estimated[60:, :3, 3]
-    assert np.linalg.norm(standing - standing[0], axis=1).max() < 0.1
+            at[k] = at[motion.from_frame] @ Pose(motion.R_prev_curr, motion.t_prev_curr_m)
+    assert max(np.linalg.norm(at[k].p - at[60].p) for k in range(60, len(recording))) < 0.1

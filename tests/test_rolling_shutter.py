@@ -12,15 +12,13 @@ import pytest
 
 from birdslam.calibration.lens_windows import CornersOfImage
 from birdslam.calibration.readout import USUAL, readout_of_drive
-from birdslam.geometry.camera import Camera, Undistorter
+from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import Pose
 from birdslam.geometry.rolling_shutter import RollingShutter
 from birdslam.odometry.motion import uneven_cov
-from birdslam.odometry.odometry import Odometry
 from birdslam.odometry.road.alignment import RoadAlignConfig, RoadAligner
 from birdslam.odometry.road.fit import RoadFit
 from birdslam.sources.camera_file import camera_text, load_camera
-from birdslam.sources.opening import open_recording
 from birdslam.sources.recording import DatasetError
 
 CAMERA = Camera(640, 360, 520.0, 520.0, 319.5, 179.5, height_m=1.35, readout_s=0.03)
@@ -101,25 +99,6 @@ def compared(readout_s: float, share: float) -> float:
 def length_of(fit: RoadFit) -> float:
     """The log of the length, where tilt and curvature are known to be none."""
     return float(fit.state[0] - fit.cov[0, 1:] @ np.linalg.solve(fit.cov[1:, 1:], fit.state[1:]))
-
-
-@pytest.mark.parametrize("name", ["phone", pytest.param("wide", marks=pytest.mark.slow)])
-def test_a_film_whose_readout_is_known_is_as_long_as_the_way(name: str) -> None:
-    """Of a rendered phone, 30 ms, the way was 3.2 % too long."""
-    camera = load_camera(FILMS / f"{name}.toml")
-    assert camera.readout_s > 0.0
-    recording = open_recording(f"video:{FILMS / name}.mp4", camera)
-    with np.load(FILMS / f"{name}.npz") as kept:
-        at_m = kept["T_world_cam"][:, :3, 3]
-    odometry, undistort = Odometry(camera), Undistorter(camera)
-    way_m = true_m = 0.0
-    for k, frame in enumerate(recording.frames()):
-        assert frame.image is not None
-        motion = odometry.estimate(odometry.track(undistort(frame.image)), k, k * 100_000_000, NO_BOXES, None)
-        if motion is not None:
-            way_m += float(np.linalg.norm(motion.t_prev_curr_m))
-            true_m += float(np.linalg.norm(at_m[k] - at_m[motion.from_frame]))
-    assert abs(way_m / true_m - 1.0) < 0.015
 
 
 def corners(readout_s: float, images: int, seed: int, rate_hz: float = 20.0) -> list[CornersOfImage]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -12,11 +10,9 @@ from birdslam.geometry.camera import Camera
 from birdslam.odometry.motion import Motion
 from birdslam.odometry.odometry import Odometry
 from birdslam.odometry.speed.stillness import NearRoadStillness, StillnessConfig
-from birdslam.perf.accuracy.drives import Task, read
-from birdslam.perf.accuracy.overlays import measure
 from birdslam.types import Status
-from birdslam.world.windscreen import from_share
-from tests.cases import first
+
+pytestmark = pytest.mark.numeric
 
 WIDTH_PX, HEIGHT_PX, HORIZON_PX = 384, 216, 96
 CAMERA = Camera(WIDTH_PX, HEIGHT_PX, 320.0, 320.0, 191.5, 96.0, height_m=1.3)
@@ -137,15 +133,6 @@ def test_a_stop_behind_rain_is_found_within_a_second_and_a_half() -> None:
     assert not any(stands[:16])
     assert all(stands[28:])
     assert np.array_equal(motions[-1].t_prev_curr_m, np.zeros(3))
-
-
-@pytest.mark.parametrize(("name", "share"), first(0, [("motorway_20", 0.0), ("night_street", 0.5)]))
-def test_rain_over_a_rendered_drive_stops_nobody(name: str, share: float) -> None:
-    """By night, where drops have nearly all corners, and over smooth asphalt, where they have them from the start."""
-    task = Task(str(Path(__file__).parent / "roads" / name), "", False, 1, 1, 0, None)
-    row = measure(read(task, from_share("rain", 1, share))[1], share)
-    assert row["standstill"] == row["wrong_valid"] == 0
-    assert row["obstructed"] > 0.4 * row["frames"]
 
 
 def _noisy(speed_mps: float, contrast_grey: float, noise_grey: float, grain: bool = False) -> NearRoadStillness:

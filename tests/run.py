@@ -1,0 +1,117 @@
+"""`make test`: the tests that compute, then those that start processes, and one line that sums up both.
+
+python -m tests.run                       # both parts; the second runs where the first has failed, too
+python -m tests.run --cpus [NAME ...]     # the tests that compute, under the kernels of other processors: a table
+python -m tests.run --sample              # of that two variants and the tests marked `numeric`: .ci/run
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import os
+import subprocess
+import sys
+import tempfile
+import time
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from birdslam.perf.accuracy.cpus import VARIANTS
+
+ON_EACH_CHANGE = "not slow and not faults and not onroad"
+COMPUTING = f"not processes and {ON_EACH_CHANGE}"
+SAMPLE = ("Nehalem", "perturbed tracks 1")
+PERTURBED = {f"perturbed tracks {seed}": {"BIRDSLAM_ROUNDING": str(seed)} for seed in range(1, 4)}
+NO_TESTS = 5  # pytest's exit status
+
+
+@dataclass
+class Result:
+    """What one run of pytest came to."""
+
+    passed: int = 0
+    failed: int = 0
+    skipped: int = 0
+    seconds: float = 0.0
+    status: int = 0
+
+    def __add__(self, other: Result) -> Result:
+        return Result(
+            self.passed + other.passed,
+            self.failed + other.failed,
+            self.skipped + other.skipped,
+            self.seconds + other.seconds,
+            self.status or other.status,
+        )
+
+    def __str__(self) -> str:
+        text = f"{self.passed} passed, {self.failed} failed, {self.skipped} skipped in {self.seconds:.0f} s"
+        return text if self.failed or not self.status else f"{text}; pytest ended with status {self.status}"
+
+
+def pytest(marks: str, jobs: int, environment: Mapping[str, str], arguments: Sequence[str] = ()) -> Result:
+    """Runs the tests with these marks in so many processes."""
+    with tempfile.TemporaryDirectory() as folder:
+        report = Path(folder) / "report.xml"
+        command = [sys.executable, "-m", "pytest", "-n", str(jobs), "--dist", "worksteal", "-m", marks]
+        began = time.monotonic()
+        done = subprocess.run(
+            [*command, f"--junitxml={report}", *arguments], check=False, env={**os.environ, **environment}
+        )
+        seconds = time.monotonic() - began
+        if done.returncode == NO_TESTS or not report.is_file():
+            return Result(seconds=seconds, status=done.returncode)
+        suite = next(iter(ET.parse(report).getroot()))
+    count = {name: int(suite.attrib[name]) for name in ("tests", "failures", "errors", "skipped")}
+    failed = count["failures"] + count["errors"]
+    return Result(count["tests"] - failed - count["skipped"], failed, count["skipped"], seconds, done.returncode)
+
+
+def kernels() -> str:
+    """Which kernels the libraries have chosen on this processor."""
+    name = "unknown"
+    for library in sorted((Path(np.__file__).parents[1] / "numpy.libs").glob("libscipy_openblas*")):
+        function = getattr(ctypes.CDLL(str(library)), "scipy_openblas_get_corename64_", None)
+        if function is not None:
+            function.restype = ctypes.c_char_p
+            name = function().decode()
+    return f"OpenBLAS {name}; OpenCV {cv2.getCPUFeaturesLine().split('*')[-1].strip()}; {os.cpu_count()} cores"
+
+
+def under_variants(names: Sequence[str], marks: str) -> int:
+    """Prints a table of the variants; 1 where a test fails under any."""
+    known, rows, cores = {**VARIANTS, **PERTURBED}, [], os.cpu_count() or 2
+    for name in names:
+        print(f"== {name}", flush=True)
+        rows.append((name, pytest(marks, cores, known[name])))
+    print("\n| variant | passed | failed | seconds |\n|---|---|---|---|")
+    for name, result in rows:
+        print(f"| {name} | {result.passed} | {result.failed} | {result.seconds:.0f} |")
+    return int(any(result.status for _, result in rows))
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m tests.run")
+    parser.add_argument("--cpus", nargs="*", metavar="NAME", help="variants; without a name all of them")
+    parser.add_argument("--sample", action="store_true", help="two variants, and the tests marked `numeric`")
+    options = parser.parse_args()
+    if options.sample:
+        return under_variants(SAMPLE, f"numeric and {COMPUTING}")
+    if options.cpus is not None:
+        return under_variants(options.cpus or [*VARIANTS, *PERTURBED], COMPUTING)
+    print(f"kernels: {kernels()}", flush=True)
+    computing = pytest(COMPUTING, os.cpu_count() or 2, {})
+    processes = pytest(f"processes and {ON_EACH_CHANGE}", 3, {})
+    total = computing + processes
+    print(f"make test: {total} (computing {computing.seconds:.0f} s, processes {processes.seconds:.0f} s)")
+    return int(total.status != 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
