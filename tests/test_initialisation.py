@@ -193,8 +193,8 @@ def _starts(data_dir: Path, sequence: str, every: int, mirrored: bool) -> tuple[
 def test_cold_starts_on_real_roads_have_the_right_scale(data_dir: Path) -> None:
     """Streets and a ramp of 21 m radius, as they are and mirrored; about 25 starts.
 
-    Over processors and perturbed tracks: median error 0.5 to 0.6 %, 83 % valid, 2 % of the motions wrong by a tenth while
-    valid.
+    Over processors and perturbed tracks: median error 0.5 to 0.6 %, 83 % valid, 2 % of the motions wrong by a tenth
+    while valid.
     """
     rows, motions = [], 0
     for sequence, every, mirrored in (("00", 20, False), ("01", 8, False), ("06", 8, False), ("01", 5, True)):
