@@ -123,7 +123,7 @@ GROUPS = (
     ),
     Group(
         "The car's own speed, or odometry",
-        "See [speed.md](speed.md). Options: `--speed`, `--speed-topic`, `--odometry`.",
+        "See [sources.md](sources.md). Options: `--speed`, `--speed-topic`, `--odometry`.",
         {
             "source.speed": 'Which file has the car\'s own speed? Lines of time in s, speed in m/s; "": none',
             "source.topics.speed": "Which topic of a ROS bag has it? TwistStamped, TwistWithCovarianceStamped or "
@@ -147,7 +147,7 @@ GROUPS = (
     ),
     Group(
         "Rates and budgets",
-        "See [realtime.md](realtime.md). ROLE is detector, segmenter, depth or multitask.",
+        "See [deployment.md](deployment.md). ROLE is detector, segmenter, depth or multitask.",
         {
             "perceive.deadline_ms": "How long after its capture does an image wait for networks? none: three quarters "
             "of "
@@ -203,7 +203,7 @@ GROUPS = (
     ),
     Group(
         "Processes and real time",
-        "See [realtime.md](realtime.md). NODE is capture, perceive or optimize.",
+        "See [deployment.md](deployment.md). NODE is capture, perceive or optimize.",
         {
             "runtime.runtime_dir": 'Where are sockets, locks and vitals? "": in the user\'s own folder',
             "runtime.ready_timeout_s": "How long may a node take to load, to warm up and to find the others?",
@@ -234,7 +234,7 @@ GROUPS = (
     ),
     Group(
         "A fleet",
-        "See [fleet.md](fleet.md). `[fleet]` is a vehicle's or a listener's, `[router]` that of `birdslam router`.",
+        "See [deployment.md](deployment.md). `[fleet]` is a vehicle's or a listener's, `[router]` that of `birdslam router`.",
         {
             "fleet.router": 'Where is the router? tls/HOST:PORT; "": there is none',
             "fleet.ca": "Which file is the fleet's authority? FILE.pem",

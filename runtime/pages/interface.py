@@ -1,4 +1,4 @@
-"""The interface page (docs/interface.md), made from the topology and the records: `birdslam interface` prints it."""
+"""The reference of docs/planner.md, from the topology and the records: `birdslam interface` prints it."""
 
 from __future__ import annotations
 
@@ -24,70 +24,32 @@ from birdslam.types import INVALIDATING, Estimate, SpeedReading, Status
 _VEHICLE = "VEHICLE"
 _TRANSFORM = re.compile(r"T_([a-z]+)_([a-z]+)")
 _PAGE = """\
-# What a vehicle says, and how to listen
+## Messages
 
-Made by `birdslam interface > docs/interface.md` from the records and the topology; a test holds it to them.
-[examples/planner.py](examples/planner.py) listens with BirdSLAM's own client, [examples/plain.py](examples/plain.py)
-with nothing but zenoh and MessagePack.
-
-Every message is one MessagePack map (or, where a record says so, an array) of at most {bytes:,} B under a zenoh key
-`birdslam/{vehicle}/{version}/...`. A number is always finite, but in {reading}. Fields may be appended: ignore what you
-do not know. A changed meaning is another version in the key.
-
-On the vehicle's computer, as its own user: connect to `unixsock-stream/DIR/{vehicle}/hub.sock` with multicast
-scouting off, where DIR is `runtime.runtime_dir` (of the service: `/run/birdslam`). From elsewhere, or as another
-user: through the gate, by mutual TLS ([deploy/README.md](../deploy/README.md)). Planners may read `estimate`, `map`,
-`map_pose`, `health/*` and `alive/*`, and send every query; `frame` and `measurements` are for the nodes alone. `speed`
-is the one topic that comes from outside: the car's own computer sends it, and nobody else may ([The car's own
-speed](#the-cars-own-speed)). At the router of a fleet ([fleet.md](fleet.md)) `estimate`, `health/*` and `alive/*` of
-many vehicles stand under the same keys; their traces end with the stage `uplink`.
+Every message is one MessagePack map of at most {bytes:,} B (an array where a record is marked as one), under a zenoh key
+`birdslam/{vehicle}/{version}/...`. Numbers are finite, except in {reading}. Ignore fields that you do not know: fields may
+be appended, and a changed meaning gets a new version in the key.
 
 ## Keys
 
 {keys}
 
-All are sent with congestion control DROP, express; *urgent* ones with priority REAL_TIME, others with DATA_LOW. A
-*hot* topic's older messages are worth nothing once there is a newer one: read it with a queue of one
-(`RingChannel(1)`). Of the others a few may wait: the length of our own readers' queues stands in brackets. Who reads
-too slowly loses messages; nobody slows the vehicle down.
+All are sent with congestion control DROP, express; *urgent* keys with priority REAL_TIME, others with DATA_LOW. Read a
+*hot* key with a queue of one (`RingChannel(1)`), since only its newest message matters. The number in brackets is the
+length of the queue of our own readers. A slow reader loses messages and never delays the vehicle.
 
 ## Queries
 
 {queries}
 
-Ask for the exact key (`{example}`): wildcards get no reply. Query with consolidation NONE: a long reply comes in
-several messages of the same record, whose lists belong together, each with a {part} attached. The payload of an error
-is its reason as text. A reader of `estimate` or `health/*` that comes late asks that same key for the last message.
+Query the exact key (`{example}`): wildcards get no reply. Use consolidation NONE: a long reply consists of several
+messages of the same record, each with a {part} attached; concatenate their lists. The payload of an error is its reason
+as text. Querying the key of `estimate` or `health/*` returns its last message.
 
-## The car's own speed
+## Limits
 
-A car that knows the speed of its wheels may send `speed`, each {reading} as a plain MessagePack map, 20 to 100 times a
-second; [examples/car_speed.py](examples/car_speed.py) does, with nothing but zenoh and MessagePack. `t_ns` is when the
-speed held, by CLOCK_MONOTONIC of the vehicle's computer, as `t_capture_ns`; a live camera's `t_source_ns` is of that
-clock too, and beside a paced recording capture puts readings into the recording's. A car whose computer does not share
-it sends `t_ns` 0, and the reading bears the time when it came. Each frame bears
-the readings of the second before it, {kept} at the most and then the newest; what is lost beyond is counted in the
-health of capture (`speeds_dropped`), as are messages that are no readings (`malformed`). Numbers that no car has, NaN
-among them, are no malformed message: the estimate's status reports them. `Estimate.speed_sources` says what the metres
-rest on. [speed.md](speed.md) has files, recordings and the rest.
-
-## What may be driven by
-
-Three answers are separate. **Alive**: the liveliness token `alive/optimize` is there. **On time**: `t_capture_ns` is
-young enough on this computer's CLOCK_MONOTONIC (elsewhere `t_utc_ns`, with synchronised clocks); estimates come
-within {budget_ms:g} ms at the {percentile:g}th percentile unless the configuration's `budgets` say otherwise.
-**Valid**: the field `valid`. An estimate that is all three may be driven by. No message never means that all is well:
-past its limit a reader itself reports that its estimate is stale, as `Planner.estimates` does.
-
-`map_pose` is of another frame and another trust: the pose of `world` (REP-105's odom) in a map of places (REP-105's
-map), said some time later and at low priority, with its own state and covariance. The ego in the map is
-`T_map_odom @ T_world_ego` of any estimate of the same `epoch`; it jumps where `map_epoch` rises, estimates never do.
-Nobody waits for the map process, and without one nothing is said ([maps.md](maps.md)).
-
-`epoch` names the world frame. Where it rises, poses, map and trajectory began anew and must not be compared with
-older ones. `frame_id` never falls within a run. Frames that perceive does not answer in time are published as
-`coasting` with a growing covariance, then as invalid; the last of them is published again, corrected, once its
-measurements are there.
+An estimate arrives within {budget_ms:g} ms of its frame's capture at the {percentile:g}th percentile, unless `budgets` of
+the configuration say otherwise. A frame holds the {kept} newest readings of the vehicle speed at most.
 
 ## Statuses
 
@@ -95,10 +57,9 @@ measurements are there.
 
 ## Attachments
 
-Every message of a topic carries a {trace}: what each node did with the frame, and with an estimate also what was left
-of the budget end to end when it was done. A stage's `done_ns - received_ns` is that node's step; from its `sent_ns`
-to the next stage's `arrived_ns` is the hop between them, and from there to its `received_ns` the record waits in the
-node's queue. Of a coasted frame perceive's stage is missing.
+Every message of a topic has a {trace} attached, with a stage for each node that handled the frame. `done_ns -
+received_ns` is the node's step; from `sent_ns` to the next stage's `arrived_ns` is the hop, and from there to its
+`received_ns` the wait in the node's queue. The stage of perceive is missing for a coasted frame.
 
 ## Records
 
@@ -111,7 +72,7 @@ On the wire a pose `T_a_b`, that of b in a, is `[x_m, y_m, yaw_rad]`.
 
 
 def page() -> str:
-    """The whole page, in Markdown."""
+    """The last sections of the page, in Markdown."""
     budgets = BudgetsConfig()
     return _PAGE.format(
         bytes=MAX_MESSAGE_BYTES,

@@ -1,4 +1,4 @@
-"""The page of all sources (docs/sources.md), made from the table of schemes: `birdslam sources` prints it."""
+"""The tables of docs/sources.md, from the table of schemes: `birdslam sources` prints them."""
 
 from __future__ import annotations
 
@@ -7,32 +7,25 @@ from birdslam.runtime.schemes import all_schemes
 from birdslam.sources.schemes import Scheme
 
 _PAGE = """\
-# Where frames come from
-
-Made by `birdslam sources > docs/sources.md` from the tables in `birdslam/sources/schemes.py` and `runtime/schemes.py`;
-a test holds it to the code. `birdslam run --source URI` takes any of them, `calibrate`, `batch` and `evaluate` those
-that are recorded.
+## All sources
 
 {what}
 
-**Camera.** *calibration*: the source says all of its camera. *intrinsics*: the camera's height over the road may be
-missing. *frame size* and *nothing*: a camera file is needed (`--camera FILE`, [calibration.md](calibration.md)), which
-goes before what any source says.
-
-**Clock.** *recorded times* are those of each frame; where a recording has none, frames follow each other at its frame
-rate. *frame rate*: they always do. *this computer's*: a frame bears the time at which it came.
+*Camera*: with *calibration* the source has the whole camera; with *intrinsics* the camera height may be missing; with
+*frame size* or *nothing* a camera file is needed. `--camera FILE` replaces what the source provides. *Clock*: *recorded
+times* are those of each frame, or follow the frame rate where a recording has none; *this computer's* is the time of
+arrival.
 
 {takes}
 
-`uri`, `rate` and `frames` of `[source]` hold for every source ([configuration.md](configuration.md)); `rate = "max"` is
-for recordings. Other keys that a source does not take are ignored.
-A path without a scheme is for `birdslam batch` the first of these that recognises it, for `calibrate` and `evaluate` a
-KITTI directory.
+`uri`, `rate` and `frames` of `[source]` hold for every source; `rate = "max"` is for recordings. Keys that a source does
+not take are ignored, or are an error where the table says so. `birdslam batch` accepts a path without a scheme and uses
+the first source that recognises it; `calibrate` and `evaluate` take such a path as a KITTI directory.
 """
 
 
 def page() -> str:
-    """The whole page, in Markdown."""
+    """The last section of the page, in Markdown."""
     schemes = all_schemes()
     what = [("source", "what it is", "frames", "camera", "clock"), *map(_what, schemes)]
     takes = [
