@@ -17,7 +17,7 @@ CORES := $(or $(shell nproc 2>/dev/null),2)
 unexport PYTHONDONTWRITEBYTECODE
 ON_EACH_CHANGE := not slow and not faults and not onroad
 
-.PHONY: setup lock newest browser test test-cpus test-cpus-sample test-slow pythons wheel-test index-test pages wheels fuzz faults onroad perf lint types train demo demo-kitti clean
+.PHONY: setup lock newest browser test test-cpus test-cpus-sample test-slow pythons wheel-test index-test pages fuzz faults onroad perf lint types train demo demo-kitti clean
 
 setup: $(VENV)/.ready
 
@@ -89,7 +89,7 @@ $(SITE_VENV)/.ready: pyproject.toml
 	$(SITE_VENV)/bin/python -m pip install --quiet --disable-pip-version-check '.[site]'
 	@touch $@
 
-# Wheel, source distribution, the list of what is in them and their digests, in out/dist: docs/release.md
+# Wheel, source distribution, the list of what is in them and their digests, in out/dist: docs/deployment.md
 dist: $(DIST_VENV)/.ready
 	$(DIST_VENV)/bin/python .ci/dist.py out/dist
 
@@ -101,10 +101,6 @@ $(DIST_VENV)/.ready: pyproject.toml
 # Which written pages are older than what they measure; WRITE=1 measures those anew, WRITE="NAME ..." these
 pages: setup
 	$(BIN)/python -m perf pages $(if $(WRITE),--write $(filter-out 1,$(WRITE)))
-
-# Which wheels there are of what is needed, by architecture and Python: docs/wheels.csv; it asks pip's index
-wheels: setup
-	$(BIN)/python -m perf pages --write wheels
 
 # A million mutated messages, references and files; FUZZ_SEED=N gives others.
 fuzz: setup

@@ -1,8 +1,7 @@
-"""What can be installed, and where: wheels of what is needed, the package's own words, the Containerfile."""
+"""What can be installed, and where: the Pythons of the package, the Containerfile, the browser of the tests."""
 
 from __future__ import annotations
 
-import csv
 import re
 import shlex
 import shutil
@@ -13,42 +12,17 @@ from pathlib import Path
 import pytest
 
 from birdslam.runtime.cli.commands import parse
-from tests import containerfile, wheels
+from tests import containerfile
 
-PROJECT = tomllib.loads((wheels.ROOT / "pyproject.toml").read_text())["project"]
-
-
-def rows() -> dict[str, dict[str, str]]:
-    with wheels.TABLE.open(encoding="utf-8") as file:
-        return {row["package"]: row for row in csv.DictReader(file)}
-
-
-@pytest.mark.parametrize("requirement", wheels.requirements())
-def test_what_is_needed_has_wheels_everywhere(requirement: str) -> None:
-    """The table is of the requirements as they are now: `make wheels` writes it anew."""
-    name, bounds = re.fullmatch(r"([A-Za-z0-9._-]+)(.*)", requirement).groups()  # type: ignore[union-attr]
-    row = rows()[wheels.normalised(name)]
-    assert row["asked by"] == " ".join(wheels.requirements()[requirement]).strip()
-    for combination in wheels.COMBINATIONS:
-        version, needs = row[combination].split()
-        assert needs == "any" or int(needs.removeprefix("2.")) <= wheels.GLIBC
-        numbers = [int(part) for part in re.findall(r"\d+", version)]
-        for operator, bound in re.findall(r"(>=|<)([0-9.]+)", bounds):
-            limit = [int(part) for part in bound.split(".")]
-            assert numbers >= limit if operator == ">=" else numbers < limit
-
-
-def test_what_they_need_has_wheels_too() -> None:
-    others = [row for row in rows().values() if row["asked by"] == "-"]
-    assert len(others) > 20
-    for row in others:
-        assert all(row[combination] for combination in wheels.COMBINATIONS), row
+ROOT = Path(__file__).resolve().parent.parent
+PYTHONS = ("3.11", "3.12", "3.13")
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
 def test_the_package_says_on_which_pythons_it_runs() -> None:
     told = re.findall(r"Python :: (3\.\d+)", " ".join(PROJECT["classifiers"]))
-    assert tuple(told) == wheels.PYTHONS
-    assert PROJECT["requires-python"] == f">={wheels.PYTHONS[0]}"
+    assert tuple(told) == PYTHONS
+    assert PROJECT["requires-python"] == f">={PYTHONS[0]}"
 
 
 def test_the_containerfile_is_one() -> None:
@@ -65,7 +39,7 @@ def test_the_containerfile_is_one() -> None:
                 [w for w in step.words if w.startswith("--") == is_flag] for is_flag in (True, False)
             ]
             assert all(flag.removeprefix("--from=") in stages for flag in flags)
-            assert flags or all((wheels.ROOT / source).exists() for source in sources)
+            assert flags or all((ROOT / source).exists() for source in sources)
     last = {step.name: step for step in steps}
     assert "useradd" in " ".join(step.text for step in steps if step.name == "RUN")
     assert last["USER"].words == ["birdslam"]
@@ -96,7 +70,7 @@ def test_root_installs_a_browser_and_others_are_told(tmp_path: Path, user: int, 
         (tmp_path / name).write_text(f"#!{shell}\n{line}\n")
         (tmp_path / name).chmod(0o755)
     done = subprocess.run(
-        [make, "-C", wheels.ROOT, "--silent", "browser", f"SHELL={shell}"],
+        [make, "-C", ROOT, "--silent", "browser", f"SHELL={shell}"],
         env={"PATH": str(tmp_path)},
         capture_output=True,
         text=True,

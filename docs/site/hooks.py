@@ -11,12 +11,8 @@ from mkdocs.structure.files import File
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 PAGES = {  # page of the checkout -> of the site
-    "README.md": "index.md",
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
-    "deploy/README.md": "deploy.md",
-    "perf/README.md": "benchmarks.md",
-    "perf/results/report.md": "benchmark-report.md",
 }
 WORKER = "assets/iframe-worker.js"  # the search of a site that is opened from disk; mkdocs.yml names it too
 _LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s#]+)(#[^)]*)?\)")

@@ -29,8 +29,8 @@ There are {count} keys. All other numbers are constants of the code: a file that
 constant. Python programs can change them (`birdslam.slam.SlamConfig`), and experiments with `--constant KEY=VALUE`.
 [constants.md](constants.md) lists those that were tuned on data.
 
-Units follow the endings of the keys: m, s, rad, px; a *fraction* is 1 for the whole. *Required* applies only if the table is
-present.
+Units follow the endings of the keys: m, s, rad, px; a *fraction* is 1 for the whole. *Required* applies only if the
+table is present.
 
 {groups}
 """

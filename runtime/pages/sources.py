@@ -18,9 +18,9 @@ arrival.
 
 {takes}
 
-`uri`, `rate` and `frames` of `[source]` hold for every source; `rate = "max"` is for recordings. Keys that a source does
-not take are ignored, or are an error where the table says so. `birdslam batch` accepts a path without a scheme and uses
-the first source that recognises it; `calibrate` and `evaluate` take such a path as a KITTI directory.
+`uri`, `rate` and `frames` of `[source]` hold for every source; `rate = "max"` is for recordings. Keys that a source
+does not take are ignored, or are an error where the table says so. `birdslam batch` accepts a path without a scheme and
+uses the first source that recognises it; `calibrate` and `evaluate` take such a path as a KITTI directory.
 """
 
 
