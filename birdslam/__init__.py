@@ -1,7 +1,7 @@
-"""Monocular multibody SLAM in bird's-eye view: what a program imports. docs/api.md is its page.
+"""Monocular multibody SLAM in bird's-eye view: what a program imports. docs/planner.md is its page.
 
     slam = BirdSLAM.with_shipped_networks(recording.camera, recording.rate_hz)
-    for frame in recording.undistorted_frames():  # open_recording("video:drive.mp4", load_camera("camera.toml"))
+    for frame in recording.undistorted_frames():  # open_recording("video:drive.mp4", load_camera(Path("camera.toml")))
         measurements, estimate = slam.step(frame)
 
 A name is loaded when it is first asked for: BLAS reads the number of its threads from the environment when numpy is

@@ -234,7 +234,8 @@ GROUPS = (
     ),
     Group(
         "A fleet",
-        "See [deployment.md](deployment.md). `[fleet]` is a vehicle's or a listener's, `[router]` that of `birdslam router`.",
+        "See [deployment.md](deployment.md). `[fleet]` is a vehicle's or a listener's, `[router]` that of "
+        "`birdslam router`.",
         {
             "fleet.router": 'Where is the router? tls/HOST:PORT; "": there is none',
             "fleet.ca": "Which file is the fleet's authority? FILE.pem",

@@ -1,4 +1,4 @@
-"""The whole system on one screen: which nodes there are, and which records pass between them (docs/interface.md).
+"""The whole system on one screen: which nodes there are, and which records pass between them (docs/planner.md).
 
 speed of the car, if it sends one
           v

@@ -141,7 +141,7 @@ def test_a_folder_holds_few_modules(folder: Path) -> None:
     assert len([path for path in folder.glob("*.py") if path.name != "__init__.py"]) <= MOST_MODULES
 
 
-LONGER_HEAD = {"birdslam.types"}  # its head is the section of frames and units of docs/interface.md
+LONGER_HEAD = {"birdslam.types"}  # its head is the section of frames and units of docs/planner.md
 
 
 def test_the_head_of_a_module_is_at_most_eight_lines() -> None:

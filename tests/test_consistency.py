@@ -218,7 +218,7 @@ def test_errors_that_last_are_not_averaged_away() -> None:
 
 
 LESS_SURE = pytest.mark.xfail(
-    reason="what is left out of the landmarks' sum: docs/ablations.md has why it stays so", strict=True
+    reason="what is left out of the landmarks' sum: correlations that the sum to one edge drops", strict=True
 )
 
 

@@ -2,7 +2,7 @@
 
 Two estimates of how probably a vehicle stands, the front end's (vehicles/state/parallax.py) and the Savage-Dickey
 density ratio of the graph's velocity, are pooled by the mean of their log odds (Genest and Zidek 1986). From that comes
-a decision with hysteresis, and a velocity with the covariance of a mixture. docs/method.md ("Standing or driving") has
+a decision with hysteresis, and a velocity with the covariance of a mixture. docs/method.md ("Stationary or moving") has
 the equations and the reasons.
 """
 

@@ -1,7 +1,7 @@
 """The car says how fast it is, with nothing but zenoh and MessagePack: lines of speed_mps [yaw_rate_radps] come in.
 
-python speed/readings.py DIR/VEHICLE/hub.sock [VEHICLE]    on the vehicle's computer, as its own user
-python speed/readings.py car.json5 [VEHICLE]               from elsewhere, by the car's certificate (deploy/README.md)
+python car_speed.py DIR/VEHICLE/hub.sock [VEHICLE]    on the vehicle's computer, as its own user
+python car_speed.py car.json5 [VEHICLE]               from elsewhere, by the car's certificate (docs/deployment.md)
 """
 
 import json

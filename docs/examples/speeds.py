@@ -1,4 +1,4 @@
-"""Distance and speed of a detector's boxes, drawn: python speeds.py VIDEO CAMERA.toml BOXES OUT.mp4 (docs/api.md)"""
+"""Distances and speeds of boxes: python speeds.py VIDEO CAMERA.toml BOXES OUT.mp4 (docs/planner.md)"""
 
 import sys
 from pathlib import Path

@@ -59,7 +59,7 @@ COMMANDS = (
     Command("deploy",
             "write what installs the service on a vehicle computer: DIR/deploy/install.sh, units, configuration",
             "vehicle.deploy"),
-    Command("interface", "print what a vehicle publishes and how to listen: docs/interface.md",
+    Command("interface", "print what a vehicle publishes and how to listen: docs/planner.md",
             "pages", "print_interface", ""),
     Command("configuration", "print every key with its default: docs/configuration.md",
             "pages", "print_configuration", ""),

@@ -8,7 +8,7 @@ from birdslam.runtime.pages import configuration, interface, sources
 
 
 def print_interface(options: argparse.Namespace) -> int:
-    """Keys, records and statuses: docs/interface.md."""
+    """Keys, records and statuses: docs/planner.md."""
     print(interface.page(), end="")
     return 0
 

@@ -3,5 +3,6 @@
     vehicle's bus --> [uplink] --mutual TLS--> [router] --mutual TLS--> listeners: `birdslam top --all`, Fleet
 
 `uplink` is a planner of its own vehicle's bus that forwards to the router what it receives; only queries come in.
-`router` lets each vehicle write its own keys alone. `listener` is the client of all vehicles. docs/fleet.md sets it up.
+`router` lets each vehicle write its own keys alone. `listener` is the client of all vehicles.
+docs/deployment.md sets it up.
 """

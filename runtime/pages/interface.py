@@ -26,9 +26,9 @@ _TRANSFORM = re.compile(r"T_([a-z]+)_([a-z]+)")
 _PAGE = """\
 ## Messages
 
-Every message is one MessagePack map of at most {bytes:,} B (an array where a record is marked as one), under a zenoh key
-`birdslam/{vehicle}/{version}/...`. Numbers are finite, except in {reading}. Ignore fields that you do not know: fields may
-be appended, and a changed meaning gets a new version in the key.
+Every message is one MessagePack map of at most {bytes:,} B (an array where a record is marked as one), under a zenoh
+key `birdslam/{vehicle}/{version}/...`. Numbers are finite, except in {reading}.
+Ignore fields that you do not know: fields may be appended, and a changed meaning gets a new version in the key.
 
 ## Keys
 
@@ -42,14 +42,15 @@ length of the queue of our own readers. A slow reader loses messages and never d
 
 {queries}
 
-Query the exact key (`{example}`): wildcards get no reply. Use consolidation NONE: a long reply consists of several
-messages of the same record, each with a {part} attached; concatenate their lists. The payload of an error is its reason
-as text. Querying the key of `estimate` or `health/*` returns its last message.
+Query the exact key (`{example}`): wildcards get no reply.
+Use consolidation NONE: a long reply consists of several messages of the same record, each with a {part} attached;
+concatenate their lists. The payload of an error is its reason as text. Querying the key of `estimate` or `health/*`
+returns its last message.
 
 ## Limits
 
-An estimate arrives within {budget_ms:g} ms of its frame's capture at the {percentile:g}th percentile, unless `budgets` of
-the configuration say otherwise. A frame holds the {kept} newest readings of the vehicle speed at most.
+An estimate arrives within {budget_ms:g} ms of its frame's capture at the {percentile:g}th percentile, unless
+`budgets` of the configuration say otherwise. A frame holds the {kept} newest readings of the vehicle speed at most.
 
 ## Statuses
 

@@ -1,7 +1,7 @@
 """People in the world of the graph: those that the front end follows, from the ego's newest pose.
 
-They are filtered outside the graph (people/people_filter.py): as its nodes their speeds would be worse
-(docs/ablations.md), and a person's box says nothing of the ego. What they get here is the graph's world, epoch and ego,
+They are filtered outside the graph (people/people_filter.py): as its nodes their speeds would be worse,
+and a person's box says nothing of the ego. What they get here is the graph's world, epoch and ego,
 with the ego's covariance, and where frames bring no picture the way that they went on.
 """
 

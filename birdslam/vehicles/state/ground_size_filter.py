@@ -4,7 +4,7 @@
          and of every vehicle: log h, log w, edge, tilt]      and, for one frame only, of every box: log z
 
 One Kalman filter holds them all. What is wrong as long as a drive or a track lasts is a state of the drive or of the
-track, so that many frames don't average it away. Measurements: ground_measurements.py; states: docs/vehicles.md.
+track, so that many frames don't average it away. Measurements: ground_measurements.py; states: docs/road-users.md.
 """
 
 from __future__ import annotations
