@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -22,7 +23,8 @@ from birdslam.sources.recording import RecordedFrame, Recording
 from birdslam.sources.shipped_drive import DIRECTORY
 from birdslam.types import Estimate, Frame, Measurements
 
-EXAMPLES = Path(__file__).resolve().parent.parent / "docs" / "examples"
+ROOT = Path(__file__).resolve().parent.parent
+EXAMPLES = ROOT / "docs" / "examples"
 FRAMES = 12
 
 
@@ -118,3 +120,16 @@ def test_the_offline_example(tmp_path: Path) -> None:
     assert len((out / "ego.kitti.txt").read_text().splitlines()) == FRAMES
     assert (out / "bev.png").stat().st_size > 10_000
     assert len((EXAMPLES / "offline.py").read_text().splitlines()) <= 25
+
+
+def test_the_python_of_the_readme(capsys: pytest.CaptureFixture[str]) -> None:
+    """As it stands there, over the first 101 frames of the demo; it prints what the readme shows."""
+    readme = (ROOT / "README.md").read_text()
+    frames = "recording.undistorted_frames()"
+    code = next(block for block in re.findall(r"```python\n(.*?)```", readme, re.DOTALL) if frames in block)
+    exec(f"from itertools import islice\n{code.replace(frames, f'islice({frames}, 101)')}", {})
+    line = r"frame 100: \w+ \d+, \d+\.\d m ahead, \d+\.\d m/s"
+    printed = capsys.readouterr().out.splitlines()
+    assert printed
+    assert all(re.fullmatch(line, text) for text in printed)
+    assert re.search(line, readme)
