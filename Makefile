@@ -17,7 +17,7 @@ CORES := $(or $(shell nproc 2>/dev/null),2)
 unexport PYTHONDONTWRITEBYTECODE
 ON_EACH_CHANGE := not slow and not faults and not onroad
 
-.PHONY: setup lock newest browser test test-cpus test-cpus-sample test-slow pythons wheel-test index-test pages fuzz faults onroad perf lint types train demo demo-kitti clean
+.PHONY: setup lock newest browser test test-cpus test-cpus-sample test-slow pythons wheel-test index-test fuzz faults onroad perf lint types train demo demo-kitti clean
 
 setup: $(VENV)/.ready
 
@@ -98,17 +98,13 @@ $(DIST_VENV)/.ready: pyproject.toml
 	$(DIST_VENV)/bin/python -m pip install --quiet --disable-pip-version-check build 'setuptools>=77' cyclonedx-bom
 	@touch $@
 
-# Which written pages are older than what they measure; WRITE=1 measures those anew, WRITE="NAME ..." these
-pages: setup
-	$(BIN)/python -m perf pages $(if $(WRITE),--write $(filter-out 1,$(WRITE)))
-
 # A million mutated messages, references and files; FUZZ_SEED=N gives others.
 fuzz: setup
 	$(BIN)/python -m tests.fuzz --cases 1000000 --seed $(or $(FUZZ_SEED),6)
 
 # Every fault on a running vehicle: docs/faults.md
 faults: setup
-	$(BIN)/python -m perf pages --write faults
+	$(BIN)/python -m perf faults --markdown docs/faults.md
 
 # The budgets of the running system, on a machine that does nothing else
 onroad: setup

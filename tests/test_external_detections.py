@@ -22,7 +22,6 @@ from birdslam.perception import Detections
 from birdslam.perception.decoding.detection import EdgeSigma
 from birdslam.perception.external import external_detections, undistort_boxes
 from birdslam.perception.families import FAMILIES, UNKNOWN
-from birdslam.perf.perception.box_edges import Edges, fitted
 from birdslam.runtime.batch.offline import pipeline
 from birdslam.runtime.configuration import Configuration, ConfigurationError, load
 from birdslam.runtime.nodes.inference import source_detections
@@ -195,18 +194,6 @@ def test_how_sure_edges_are_goes_by_the_detectors_family(tmp_path: Path) -> None
     assert read[0].edge_sigma == FAMILIES["yolox"]
     with pytest.raises(ConfigurationError, match=r"source\.detector"):
         load(None, {"source.detector": "yolo"})
-
-
-def test_edges_are_measured_for_what_they_scatter() -> None:
-    rng, n = np.random.default_rng(1), 4000
-    side, wider = rng.uniform(25.0, 200.0, (n, 4)), rng.choice([1.0, 1.8], (n, 1))
-    rel = np.array([0.03, 0.03, 0.02, 0.05])
-    off = rng.normal(size=(n, 4)) * wider * np.hypot(side * rel, 0.5)
-    found = fitted(Edges(off, side, wider))
-    assert np.abs(np.array(found.rel) - rel).max() < 0.004
-    assert all(
-        abs(one - 0.683) < 0.06 and abs(two - 0.954) < 0.03 for one, two in Edges(off, side, wider).shares(found)
-    )
 
 
 def test_all_three_kinds_of_file_are_read(tmp_path: Path) -> None:

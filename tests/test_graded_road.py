@@ -9,7 +9,7 @@ import pytest
 
 from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera
-from birdslam.perf.accuracy.graded_road import GradedRoad
+from tests.graded_road import GradedRoad
 
 CAMERA = Camera(320, 120, 190.0, 190.0, 160.3, 55.2, height_m=1.65, pitch_rad=0.01)
 

@@ -14,8 +14,6 @@ import pytest
 from birdslam.perception import ModelSpec, Network, load_network, session
 from birdslam.perception.manifest import SHIPPED_MULTITASK, SHIPPED_NETWORKS
 from birdslam.perception.network import _Bound  # private: a failing run of an accelerator is to be had no other way
-from birdslam.perf.errors import PerfError
-from birdslam.perf.perception import providers as perf_providers
 from birdslam.runtime.configuration import Configuration, PerceiveConfig, SourceConfig, load
 from birdslam.runtime.doctor.checks import examine
 from birdslam.runtime.models import providers
@@ -168,22 +166,6 @@ def test_doctor_lists_what_is_there(tmp_path: Path) -> None:
 @pytest.mark.skipif("openvino" not in session.providers_here(), reason="onnxruntime-openvino is not installed")
 def test_openvino_gives_what_the_cpu_gives() -> None:
     assert compared("multitask", SHIPPED, ("cpu", "openvino"), within_s=0.0)["openvino"].agrees
-
-
-@pytest.mark.processes  # pip's
-def test_the_page_has_a_row_for_each_network_and_provider(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    found = {"cpu": Measured(20.0, 0.0), "openvino": Measured(12.5, 0.0753)}
-    monkeypatch.setattr(perf_providers, "compared", lambda *arguments, **more: found)
-    out = tmp_path / "providers.json"
-    (tmp_path / "theirs.onnx").touch()
-    others = {"detector": "theirs.onnx", "segmenter": "absent.onnx"}
-    perf_providers.measure("all", tmp_path, others, 2, out, "", "label")
-    text = perf_providers.page(out.read_text())
-    assert "| multitask_int8.onnx | onnxruntime | openvino | 12.5 | 7.53% | no |" in text
-    assert "| theirs.onnx | onnxruntime | cpu | 20.0 | 0.00% | yes |" in text
-    assert "absent" not in text
-    with pytest.raises(PerfError, match="no/such/package: pip does not install it"):
-        perf_providers.measure("all", tmp_path, {}, 2, None, "./no/such/package", "label")
 
 
 @stand_in

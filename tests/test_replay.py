@@ -15,7 +15,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from birdslam.graph.g2o import g2o_lines
-from birdslam.perf.latency import replay as perf_replay
 from birdslam.runtime.cli.commands import parse
 from birdslam.runtime.cli.drives import replay as replay_command
 from birdslam.runtime.configuration import ConfigurationError
@@ -456,12 +455,3 @@ def test_the_graph_is_written_as_g2o(tmp_path: Path, capsys: pytest.CaptureFixtu
     asked.g2o = tmp_path / "nowhere" / "drive.g2o"
     with pytest.raises(RecordingError, match="can't be written"):
         replay_command.run(asked)
-
-
-@pytest.mark.slow
-@pytest.mark.processes
-@pytest.mark.timeout(600)
-def test_a_long_recording_of_the_running_system_replays(data_dir: Path, tmp_path: Path) -> None:
-    clip = data_dir / "kitti_odometry" / "sequences" / "00"
-    options = ("--source", f"kitti:{clip}", "--minutes", "1.5", "--beside", "0", "--images")
-    assert perf_replay.run([*options, "--output", str(tmp_path / "replay.json")]) == 0

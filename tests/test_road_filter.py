@@ -14,7 +14,7 @@ from birdslam.odometry.road.fit import RoadFit
 from birdslam.odometry.road.kalman_filter import RoadFilter
 from birdslam.odometry.road.scale_confirmation import ScaleConfirmation
 from birdslam.odometry.scale_config import RoadScaleConfig
-from birdslam.perf.accuracy.graded_road import CURVE_M, GradedRoad, Stand
+from tests.graded_road import CURVE_M, GradedRoad, Stand
 
 CAMERA = Camera(931, 282, 540.0, 540.0, 456.3, 139.2, height_m=1.65)
 GRADE = 0.06

@@ -28,8 +28,6 @@ from birdslam.geometry.se2 import SE2
 from birdslam.loops.gnss.files import GNSS_FILE, GnssError, read_fixes
 from birdslam.loops.map_pose import MapPose, MapState
 from birdslam.perf.processes import free_port
-from birdslam.perf.ros2.ros import estimate, peer
-from birdslam.perf.ros2.ros_drive import without
 from birdslam.ros.bag import BagTopics
 from birdslam.ros.message_types import MessageTypes
 from birdslam.ros.messages import TOPICS, RosMessages
@@ -58,6 +56,7 @@ from birdslam.runtime.ros.session import NoRouter, RosNode, RosPublisher
 from birdslam.runtime.supervision.query_server import QueryServer
 from birdslam.sources.opening import open_recording
 from birdslam.types import Estimate, Lane, LaneLine, Lanes, LineColour, LineKind
+from tests.ros_peers import estimate, peer
 from tests.test_bus import until
 
 sdk = pytest.importorskip("zenoh_ros2_sdk")
@@ -119,7 +118,7 @@ def test_hashes_are_those_of_the_other_implementation(name: str, tmp_path: Path)
     from zenoh_ros2_sdk.message_registry import MessageRegistry
     from zenoh_ros2_sdk.utils import get_type_hash, load_dependencies_recursive
 
-    from birdslam.perf.ros2.ros_peer import write_definitions
+    from tests.ros_peer import write_definitions
 
     write_definitions(tmp_path)
     text = (tmp_path / f"{name}.msg").read_text()
@@ -285,17 +284,6 @@ def test_what_can_not_be_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[
     monkeypatch.setenv("ZENOH_SESSION_CONFIG_URI", str(tmp_path / "none.json5"))
     with pytest.raises(ConfigurationError, match=r"ZENOH_SESSION_CONFIG_URI=.*none\.json5"):
         RosNode(RosConfig(), "birdslam")
-
-
-def test_images_without_an_estimate_are_told_by_their_times() -> None:
-    images = np.arange(10, dtype=np.int64) * 30_000_000
-    assert without(images, images + 40_000).size == 0
-    assert without(images, np.delete(images, [0, 4, 9]) - 40_000).tolist() == images[[0, 4, 9]].tolist()
-    assert without(images, images[:0]).tolist() == images.tolist()
-    assert without(images, images[3:4]).tolist() == np.delete(images, 3).tolist()
-
-
-# --- through a router ---
 
 
 class Listener:

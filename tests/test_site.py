@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from birdslam.perf.browser.chromium import chromium, look
+from tests.chromium import chromium, look
 
 SCRIPT = Path(__file__).resolve().parent.parent / "docs" / "site" / "iframe-worker.js"
 PAGE = """<!doctype html><html><head><meta charset="utf-8"><script src="iframe-worker.js"></script></head><body><script>

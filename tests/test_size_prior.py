@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from birdslam.geometry.camera import Camera, GroundPlane
-from birdslam.perf.accuracy.tilt import road_by_returns
 from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
 from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
 from birdslam.vehicles.state.size_prior import SizePrior
@@ -97,15 +96,3 @@ def test_a_roll_of_the_images_that_is_off_for_long_stays_in_the_sigma() -> None:
         ground_size.predict(0.1, 0.0, tilt, np.eye(2) * 0.002**2, 1.0)
     assert math.sqrt(ground_size.tilt_cov[1, 1]) > 0.003  # 300 images are not 300 errors
     assert 0.0 < ground_size.ground.roll_rad < 0.008
-
-
-def test_the_roads_plane_is_found_among_returns_of_what_stands_on_it() -> None:
-    rng = np.random.default_rng(2)
-    z, left = rng.uniform(14.0, 26.0, 3000), rng.uniform(-5.0, 5.0, 3000)
-    pitch_rad, roll_rad = 0.012, -0.01
-    down = CAMERA.height_m + z * (-pitch_rad + roll_rad * left / z) + rng.normal(0.0, 0.02, 3000)
-    down[:900] -= rng.uniform(0.1, 1.5, 900)
-    found = road_by_returns(CAMERA, np.column_stack([-left, down, z]))
-    assert found is not None
-    assert found.tilt_rad == pytest.approx([pitch_rad, roll_rad], abs=0.002)
-    assert road_by_returns(CAMERA, np.zeros((10, 3))) is None

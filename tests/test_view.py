@@ -15,11 +15,11 @@ import numpy as np
 import psutil
 import pytest
 
-from birdslam.perf.browser.chromium import SOFTWARE_GL, chromium
 from birdslam.runtime.cli.main import main
 from birdslam.runtime.configuration import RecordingConfig
 from birdslam.runtime.recording import scene
 from birdslam.runtime.recording.recording import Latency, Recording
+from tests.chromium import SOFTWARE_GL, chromium
 from tests.taped_drive import Tape, measured
 from tests.test_pipeline import call
 

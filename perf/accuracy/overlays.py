@@ -9,7 +9,6 @@ from the first and from the middle image on. Counts valid frames with a speed of
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -156,26 +155,3 @@ def row_text(row: dict[str, Any]) -> str:
         f"{row['wrong_over_three']})  standstill {row['standstill']}  "
         f"view_obstructed {row['obstructed']}  scale {scale}"
     )
-
-
-def page(kept: str) -> str:
-    """What `--output` wrote, as a page."""
-    lines = [
-        "# What comes to lie on the windscreen",
-        "",
-        "Drops in focus (60 large ones, or 1,200 of rain) and before it, and what else is named, drawn over recorded",
-        "drives; they stand still in the image. Figures are of the images that show it, by the odometry alone, without",
-        "networks. *Wrong* is a valid frame whose speed is off by more than a tenth. *Truth doubtful* are those of the",
-        "wrong ones whose true step is interpolated or accelerates as no car does, *over three* those whose way over",
-        "three images is off by as much, too: tracking 0005's true steps are uneven (two of three 3.5 % too short, the",
-        "third 5.5 % too long), since GPS/IMU samples lie beside the images; over three steps that is gone.",
-        "",
-        "| drive, what is drawn | frames | valid | of them wrong | truth doubtful | over three | standstill | scale |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for row in json.loads(kept)["rows"]:
-        scale = "-" if row["scale_error"] is None else f"{row['scale_error']:+.1%}"
-        counts = (row[name] for name in _COUNTS if name != "obstructed")
-        cells = (row["name"], *counts, scale)
-        lines.append(f"| {' | '.join(map(str, cells))} |")
-    return "\n".join(lines) + "\n"

@@ -3,9 +3,8 @@
     python -m perf system --source demo|kitti:DIR --rate 33 --seconds 120 [--model detector=F.onnx] --output F.json
 
 The real processes run (`birdslam run`); this process is their planner. A recording is played in a loop at `--rate`,
-whatever its own. `--vehicles 0,5,10,15` drives the optimize process alone (convoy.py). `--map 3`: three pairs of runs,
-with the map process at work and without; `--lanes 3`: with lanes and without (in_turn.py). The first seconds are left
-out of the figures, but not out of the count of dropped frames.
+whatever its own. `--vehicles 0,5,10,15` drives the optimize process alone (convoy.py). The first seconds
+are left out of the figures, but not out of the count of dropped frames.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ import msgspec
 import numpy as np
 
 from birdslam.geometry.arrays import Floats
-from birdslam.perf.latency import convoy, in_turn
+from birdslam.perf.latency import convoy
 from birdslam.perf.latency.live import Ask, Run, add_run_options, drive
 from birdslam.perf.reporting.arguments import benchmark_parser, numbers
 from birdslam.perf.reporting.figures import BLOCKS, Ledger, curve, noise, spread, spread_text
@@ -44,8 +43,6 @@ def run(arguments: list[str]) -> int:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--load", type=int, default=0, help="so many busy cores beside it")
     parser.add_argument("--vehicles", type=numbers, help="a list: the optimize process alone, with so many in sight")
-    parser.add_argument("--map", type=int, default=0, metavar="PAIRS", help="in turn without and with a map of places")
-    parser.add_argument("--lanes", type=int, default=0, metavar="PAIRS", help="in turn without lanes and with them")
     parser.add_argument("--planners", type=int, default=0, help="so many further planners")
     parser.add_argument("--profile", type=Path, metavar="DIR", help="py-spy's flame graph of each process goes there")
     options = parser.parse_args(arguments)
@@ -63,11 +60,6 @@ def run(arguments: list[str]) -> int:
         profile=options.profile,
     )
     settings = {**msgspec.to_builtins(ask, enc_hook=str), "seconds": options.seconds, "load": options.load}
-    for part, pairs in (("map", options.map), ("lanes", options.lanes)):
-        if pairs:
-            with Ledger(options.output, label, **settings) as ledger, busy_cores(options.load):
-                in_turn.measure(ledger, ask, part, pairs, split, WARM_UP_S)
-            return 0
     with Ledger(options.output, label, **settings) as ledger:
         steal = Steal()
         with busy_cores(options.load), drive(ask) as result:

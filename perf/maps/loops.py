@@ -1,15 +1,14 @@
 """The same road twice: recall and false loops of places, errors of localisation, what closing a loop brings.
 
-    python -m perf loops [--output FILE.json] [--part recorded|town|loop|alike|scale|gnss|size ...] [--run DIR ...]
+    python -m perf loops [--output FILE.json] [--part recorded|town|loop|alike|gnss|size ...]
 
 `recorded`: two passes of a KITTI street in each other's map, other streets in both. `town`: rendered into --drives,
-driven twice, then otherwise. `loop`, `alike`: corners without images, equal houses. `scale`: a unit of length that
-drifts. `gnss`: fixes that jump. `size`: simulated descriptors. `--run`: what `birdslam run --gnss` left in DIR.
+driven twice, then otherwise. `loop`, `alike`: corners without images, equal houses. `gnss`: fixes that jump. `size`:
+simulated descriptors.
 """
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -29,7 +28,7 @@ from birdslam.loops.map_pose import MapState
 from birdslam.loops.place_map import MapCamera, PlaceMap
 from birdslam.loops.session import MapSession
 from birdslam.outputs.map_trajectory import MapTrajectory
-from birdslam.perf.maps import on_earth, scale_drift, simulated, town
+from birdslam.perf.maps import simulated, town
 from birdslam.perf.maps.estimates import Seen, estimated
 from birdslam.perf.reporting.arguments import add_data, benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
@@ -37,7 +36,7 @@ from birdslam.runtime.nodes.sources import open_recorded
 
 label = "places found again, poses in a kept map, loops closed; a map's size and look-up time"
 
-PARTS = "recorded", "town", "loop", "alike", "scale", "gnss", "size"
+PARTS = "recorded", "town", "loop", "alike", "gnss", "size"
 BASE_M = 0.537  # between the cameras of the two passes
 OTHERS = ("kitti_odometry/sequences/00", "kitti_odometry/sequences/06", "kitti_tracking/training/image_03/0005")
 
@@ -50,14 +49,9 @@ def run(arguments: list[str]) -> None:
     parser.add_argument("--drives", type=Path, default=Path("out/town"), metavar="DIR", help="of the rendered town")
     parser.add_argument("--way", type=float, default=2000.0, metavar="M", help="of the simulated loop")
     parser.add_argument("--equal-houses", type=float, default=5000.0, metavar="M", help="of each look-alike street")
-    parser.add_argument("--run", type=Path, nargs="+", metavar="DIR", help="on Earth: what runs with --gnss left there")
     options = parser.parse_args(arguments)
     cv2.setNumThreads(1)
     with Ledger(options.output, label, features=[str(kind) for kind in options.features], way_m=options.way) as ledger:
-        for folder in options.run or ():
-            on_earth.measure(ledger, folder)
-        if options.run:
-            return
         if "recorded" in options.part:
             recorded(ledger, options.data, [FeatureKind(kind) for kind in options.features])
         if "town" in options.part:
@@ -66,8 +60,6 @@ def run(arguments: list[str]) -> None:
             simulated.loop(ledger, options.way)
         if "alike" in options.part:
             simulated.alike(ledger, options.equal_houses)
-        if "scale" in options.part:
-            scale_drift.measure(ledger)
         if "gnss" in options.part:
             simulated.gnss(ledger, options.way)
         if "size" in options.part:
@@ -174,20 +166,3 @@ def row_text(row: dict[str, Any]) -> str:
         f"median {row['median_m']:.3f} m {row['median_deg']:.3f} deg, worst {row['worst_m']:.3f} m, "
         f"within 2 sigma {x:.2f} {y:.2f} {yaw:.2f}{size}"
     )
-
-
-def page(kept: str) -> str:
-    """What `--output` wrote, as a page."""
-    rows = [f"| {row['name']} | {row['text']} |" for row in json.loads(kept)["rows"]]
-    lines = [
-        "# Places found again",
-        "",
-        "Maps of [one street twice](maps.md) and what is localised in them. *Right* and *left* are two passes of one",
-        "KITTI street by cameras 0.537 m apart: there the truth is exact, and of every other street each localised",
-        "frame would be false. The town is rendered, with its truth. Loop, equal houses and fixes are streets of",
-        "corners without images; times are processor time of one core.",
-        "",
-        "| what | figures |",
-        "|---|---|",
-    ]
-    return "\n".join((*lines, *rows)) + "\n"

@@ -24,7 +24,6 @@ from birdslam.loops.map_pose import MapState
 from birdslam.loops.place_map import MapCamera, PlaceMap
 from birdslam.loops.session import MapSession
 from birdslam.outputs.placed import Place
-from birdslam.perf.maps import indices
 from birdslam.perf.reporting.figures import Ledger
 from birdslam.runtime.maps.drive_earth import write_earth
 from birdslam.types import NS_PER_S, Attitude
@@ -205,7 +204,7 @@ def size(ledger: Ledger) -> None:
         index = place_map.index()
         index.look_up(place_map.keyframes[0].descriptors, 6)
         built_s = time.process_time() - begun
-        took_ms, right, views, where = [], 0, [], []
+        took_ms, right = [], 0
         for number in range(0, count, max(1, count // LOOK_UPS)):
             own = place_map.keyframes[number].descriptors
             seen = own ^ np.packbits(chance.random((MOST_POINTS, 8 * DESCRIPTOR_BYTES)) < SAME_BITS, axis=1)
@@ -213,8 +212,6 @@ def size(ledger: Ledger) -> None:
             found = index.look_up(seen, 6)
             took_ms.append(1e3 * (time.process_time() - begun))
             right += number in found
-            views.append(seen)
-            where.append({number})
         data = len(encode_map(place_map))
         p50_ms, worst_ms = float(np.median(took_ms)), max(took_ms)
         text = (
@@ -230,5 +227,3 @@ def size(ledger: Ledger) -> None:
             look_up_ms=[round(each, 3) for each in took_ms],
             built_s=round(built_s, 2),
         )
-        if length_km <= COMPARED_KM:
-            indices.compare(ledger, f"map of {length_km} km", place_map, views, where)

@@ -11,19 +11,16 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
-from birdslam.loops.features import FeatureExtractor, Features
 from birdslam.loops.localiser import Localisation
 from birdslam.loops.map_file import decode_map, encode_map
 from birdslam.loops.map_pose import MapState
 from birdslam.loops.place_map import MapCamera, PlaceMap
 from birdslam.loops.session import MapSession
 from birdslam.perf.errors import PerfError
-from birdslam.perf.maps import indices
-from birdslam.perf.maps.estimates import Seen, estimated_once
+from birdslam.perf.maps.estimates import Seen, estimated
 from birdslam.perf.reporting.figures import Ledger
 from birdslam.runtime.progress import with_progress
 from birdslam.runtime.world.demo_drive import write
@@ -35,7 +32,6 @@ TWICE = "twice"
 BEGIN = "begin.npy"  # beside a drive: T_world_cam of its first image, which makes truths of two drives comparable
 FALSE_M = 2.0  # a loop, or a pose in the map, that is off by more is another place
 KIDNAPPED = ("traffic", "lane", 150)  # from this image of one drive to the first of the other
-LOOK_UPS, SAME_PLACE_M = 30, 8.0  # of a drive, for which candidates are counted; and how near these must be
 
 
 @dataclass(frozen=True)
@@ -60,16 +56,14 @@ def measure(ledger: Ledger, drives: Path) -> None:
     names = render(drives)
     place_map, T_world_map = _twice(ledger, drives / TWICE)
     kept = encode_map(place_map)
-    before = {name: list(estimated_once(drives / name)) for name in KIDNAPPED[:2]}
+    before = {name: list(estimated(f"demo:{drives / name}")) for name in KIDNAPPED[:2]}
     for name, differs in names.items():
         if name != TWICE:
             drive = _Drive.open(drives / name)
-            frames = before.get(name) or estimated_once(drives / name)
-            looks = _Looks()
-            found = _localise(kept, drive, frames, looks)
+            frames = before.get(name) or estimated(f"demo:{drives / name}")
+            found = _localise(kept, drive, frames)
             row = _judged(found, drive.truth, place_map, T_world_map)
             ledger.add(f"town: {differs}", row["text"], **row)
-            indices.compare(ledger, f"town: {differs}", place_map, *looks.places(drive.truth, place_map, T_world_map))
     _kidnapped(ledger, drives, kept, place_map, T_world_map, before)
 
 
@@ -104,7 +98,7 @@ def _twice(ledger: Ledger, folder: Path) -> tuple[PlaceMap, dict[int, SE2]]:
     T_map_world: SE2 | None = None
     last: Localisation | None = None
     localised = frames = 0
-    for estimate, image in estimated_once(folder):
+    for estimate, image in estimated(f"demo:{folder}"):
         last = session.step(estimate, image)
         if T_map_world is None and estimate.valid:
             T_map_world = estimate.T_world_ego @ drive.truth[estimate.frame_id].inverse()
@@ -150,38 +144,9 @@ def _apart(a: SE2, b: SE2) -> float:
     return float(np.hypot(a.x_m - b.x_m, a.y_m - b.y_m))
 
 
-class _Looks(FeatureExtractor):
-    """Keeps what it found in each image, with the image's frame."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.frame_id = -1
-        self._seen: list[tuple[int, NDArray[np.uint8]]] = []
-
-    def __call__(self, image: NDArray[np.uint8]) -> Features:
-        out = super().__call__(image)
-        self._seen.append((self.frame_id, out.descriptors))
-        return out
-
-    def places(
-        self, truth: list[SE2], place_map: PlaceMap, at: dict[int, SE2]
-    ) -> tuple[list[NDArray[np.uint8]], list[list[int]]]:
-        """Descriptors of some frames, and the rows of the keyframes that are near to each in truth."""
-        some = self._seen[:: max(1, len(self._seen) // LOOK_UPS)]
-        numbers = [keyframe.number for keyframe in place_map.keyframes]
-        right = [
-            [row for row, number in enumerate(numbers) if _apart(at[number], truth[frame]) < SAME_PLACE_M]
-            for frame, _ in some
-        ]
-        return [seen for _, seen in some], right
-
-
-def _localise(kept: bytes, drive: _Drive, frames: Iterable[Seen], looks: _Looks) -> list[Localisation]:
-    session, out = MapSession(drive.recording.camera, decode_map(kept), False, looks), []
-    for estimate, image in frames:
-        looks.frame_id = estimate.frame_id
-        out.append(session.step(estimate, image))
-    return out
+def _localise(kept: bytes, drive: _Drive, frames: Iterable[Seen]) -> list[Localisation]:
+    session = MapSession(drive.recording.camera, decode_map(kept), False)
+    return [session.step(estimate, image) for estimate, image in frames]
 
 
 def _errors(found: Localisation, true: SE2, place_map: PlaceMap, at: dict[int, SE2]) -> Floats:

@@ -1,6 +1,5 @@
 """How good the shipped network is: against the truth of held-out worlds, and on real frames that it never learnt from.
 
-    python -m perf networks --provider all [--onnxruntime onnxruntime-openvino] [--threads 2] [--models DIR]
     python -m perf networks [--network F.onnx] [--frames 300] [--data DIR] [--models DIR] [--output F.json]
 
 Held-out worlds need the extra [train]; without it their rows are left out and said to be. Real frames are those of
@@ -27,7 +26,7 @@ from birdslam.perception import Detections, Findings, ModelSpec, Network, load_n
 from birdslam.perception.decoding.multitask import MultiTaskDecoder
 from birdslam.perception.manifest import SHIPPED_MULTITASK, SHIPPED_NETWORKS
 from birdslam.perf.errors import PerfError
-from birdslam.perf.perception import labelled_bodies, providers
+from birdslam.perf.perception import labelled_bodies
 from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
 from birdslam.sources.opening import open_recording
@@ -57,13 +56,7 @@ def run(arguments: list[str]) -> None:
     parser.add_argument("--data", type=Path, default=Path(os.environ.get("BIRDSLAM_DATA", shared / "data")))
     parser.add_argument("--models", type=Path, default=Path(os.environ.get("BIRDSLAM_MODELS", shared / "models")))
     parser.add_argument("--threads", type=int, default=2)
-    text = "what computes networks here, how fast and how far off, in place of all else: one, or `all`"
-    parser.add_argument("--provider", metavar="NAME|all", help=text)
-    parser.add_argument("--onnxruntime", metavar="PACKAGE", help="with --provider: by this package of it as well")
     options = parser.parse_args(arguments)
-    if options.provider:
-        more = (options.threads, options.output, options.onnxruntime or "", label)
-        return providers.measure(options.provider, options.models, OTHERS, *more)
     network = load_network("multitask", ModelSpec(path=str(options.network), threads=options.threads))
     with Ledger(options.output, label, network=network.describe()) as ledger:
         if importlib.util.find_spec("numba") is None:

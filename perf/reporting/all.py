@@ -2,17 +2,15 @@
 
     python -m perf all --output DIR [--source URI] [--model ROLE=PATH]... [--thorough]
 
-The source is the shipped drive with the shipped network, so that it runs without data; the recordings of KITTI that are
-at hand have their rows of accuracy beside it, with the networks that are at hand. DIR gets report.json, report.md, its
-plots, and each benchmark's own JSON. Ctrl-C ends the suite: what was measured by then is in the report, which says what
-is missing. Without `--thorough` it takes some twenty minutes.
+The default source is the shipped drive with the shipped network, so that it needs no data. DIR gets report.json,
+report.md and the JSON of each benchmark. After Ctrl-C the report contains what was measured until then and names what
+is missing. Without `--thorough` the suite takes about twenty minutes.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
 import shlex
 import signal
 import subprocess
@@ -20,40 +18,34 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from birdslam.perf.reporting import report
 from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.reporting.figures import write_json
-from birdslam.perf.reporting.machine import ROOT, describe
+from birdslam.perf.reporting.machine import describe
 
 label = "every benchmark, and their report"
 
 END_S = 60.0  # for a benchmark to keep what it has
-SEQUENCES = ("kitti_odometry/sequences/00", "kitti_odometry/sequences/06", "kitti_raw_clip")
-NETWORKS = {"detector": "yolox_nano_416.onnx", "segmenter": "twinlitenet_640x360.onnx"}
 
 
 @dataclass(frozen=True)
 class Step:
-    """One benchmark with its options: for a quick run, and for figures to be shown. `on`: its recording."""
+    """One benchmark with its options: for a quick run, and for figures to be shown."""
 
     file: str
     benchmark: str
     quick: str
     thorough: str
-    on: Literal["", "source", "data"] = ""
+    on_source: bool = False
 
 
 STEPS = (
-    Step("system", "system", "--seconds 120", "--seconds 600", "source"),
-    Step("system-loaded", "system", "--seconds 60 --load 1", "--seconds 120 --load 1", "source"),
-    Step("system-planners", "system", "--seconds 10 --planners 4", "--seconds 60 --planners 4", "source"),
-    Step("cores", "cores", "", "", "source"),
+    Step("system", "system", "--seconds 120", "--seconds 600", on_source=True),
+    Step("system-loaded", "system", "--seconds 60 --load 1", "--seconds 120 --load 1", on_source=True),
+    Step("system-planners", "system", "--seconds 10 --planners 4", "--seconds 60 --planners 4", on_source=True),
     Step("vehicles", "system", "--vehicles 0,5,10,15 --seconds 31", "--vehicles 0,1,3,6,10,15 --seconds 60"),
-    Step("accuracy", "accuracy", "", "--rates 10,33", "source"),
-    Step("accuracy-data", "accuracy", "", "--rates 10,20,33", "data"),
-    Step("inference", "inference", "--seconds 2.5", "--seconds 10", "source"),
     Step(
         "optimizer",
         "optimizer",
@@ -94,28 +86,14 @@ def run(arguments: list[str]) -> int:
     return int(any(how.startswith("failed") for how in outcome.values()))
 
 
-def _shared(variable: str, folder: str) -> Path:
-    return Path(os.environ.get(variable) or ROOT.parent / "shared" / folder)
-
-
-def _data() -> list[str]:
-    """Recordings, labels and networks; what is not there is named by the benchmark."""
-    data, networks = _shared("BIRDSLAM_DATA", "data"), _shared("BIRDSLAM_MODELS", "models")
-    given = [f"--source=kitti:{data / sequence}" for sequence in SEQUENCES]
-    given += [f"--model={role}={networks / file}" for role, file in NETWORKS.items() if (networks / file).is_file()]
-    return [*given, f"--labels={data / 'kitti_tracking' / 'training'}"]
-
-
 def run_step(step: Step, options: argparse.Namespace) -> str:
     """How it ended. What it prints goes to the terminal as it comes."""
     file = options.output / f"{step.file}.json"
     file.unlink(missing_ok=True)
     command = [sys.executable, "-m", "birdslam.perf", step.benchmark, "--output", str(file)]
     command += shlex.split(step.thorough if options.thorough else step.quick)
-    if step.on == "source":
+    if step.on_source:
         command += ["--source", options.source, *(part for model in options.model for part in ("--model", model))]
-    elif step.on == "data":
-        command += _data()
     process = subprocess.Popen(command, start_new_session=True)
     try:
         status = process.wait()

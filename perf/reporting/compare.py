@@ -1,7 +1,6 @@
 """Two reports, figure by figure, with the noise of both: better, worse or not distinguishable.
 
     python -m perf compare A.json B.json          # A is the old one; A1.json,A2.json: several runs of one side
-    python -m perf compare REPORT.json [--keep]   # the scorecard against the last release; with --keep it becomes it
 
 Mann-Whitney U on the blocks of each series, two-sided, false discoveries of all figures together below 1 %; only a
 shift of more than 5 % counts. Exit status: 1 where something is worse, 2 where the reports can't be compared.
@@ -9,7 +8,6 @@ shift of more than 5 % counts. Exit status: 1 where something is worse, 2 where 
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -20,7 +18,6 @@ import numpy as np
 from scipy.stats import binomtest, false_discovery_control, mannwhitneyu
 
 from birdslam.perf.errors import PerfError
-from birdslam.perf.reporting import scorecard
 from birdslam.perf.reporting.arguments import benchmark_parser
 
 label = "two reports: better, worse or not distinguishable"
@@ -44,13 +41,9 @@ class Verdicts:
 def run(arguments: list[str]) -> int:
     parser = benchmark_parser("compare", label, output="")
     parser.add_argument("old", metavar="A.json", help="a report, or one benchmark's JSON; a list of several runs")
-    parser.add_argument("new", metavar="B.json", nargs="?", help="without it: A against the last release")
+    parser.add_argument("new", metavar="B.json")
     parser.add_argument("--all", action="store_true", help="show what is not distinguishable, too")
-    parser.add_argument("--keep", action="store_true", help="keep A as the results of its version, in perf/results")
     options = parser.parse_args(arguments)
-    if options.new is None:
-        _scorecard(options)
-        return 0
     old, new = _read(options.old), _read(options.new)
     machines = {report["machine"]["cpu"] for report in (*old, *new) if isinstance(report, dict) and "machine" in report}
     if len(machines) > 1:
@@ -62,13 +55,6 @@ def run(arguments: list[str]) -> int:
     counts = {verdict: sum(line.verdict == verdict for line in found) for verdict in ("better", "worse")}
     print(f"{len(found)} figures: {counts['better']} better, {counts['worse']} worse, the rest not distinguishable")
     return int(counts["worse"] > 0)
-
-
-def _scorecard(options: argparse.Namespace) -> None:
-    new = scorecard.card(_read(options.old)[0])
-    print("\n".join(scorecard.lines(scorecard.last(new.version), new)))
-    if options.keep:
-        print(f"kept in {scorecard.keep(new)}")
 
 
 def _read(paths: str) -> list[Any]:

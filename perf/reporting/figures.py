@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from birdslam.geometry.arrays import Floats
-from birdslam.perf.reporting.machine import Steal, describe
+from birdslam.perf.reporting.machine import Steal, describe, describe_text
 
 BLOCKS = 10  # a series is cut into so many pieces one after the other; how they differ is its noise
 _LEVELS = (0.0, 1.0, 5.0, *range(10, 91, 10), 95.0, 98.0, 99.0, 99.5, 99.9, 99.99)  # percent, for the plots
@@ -63,6 +63,7 @@ class Ledger:
             "rows": [],
         }
         self._steal = Steal()
+        print(describe_text(self.content["machine"]), file=sys.stderr)
 
     def add(self, name: str, shown: str, **row: Any) -> None:
         """A row, named once in the file, and what a person sees of it."""

@@ -19,7 +19,7 @@ _TICKS = slice(0, 8)  # guest time is counted in user time already
 
 
 def describe() -> dict[str, Any]:
-    """What stands in the head of a report."""
+    """Returns the date, the commit, the machine and the versions of the libraries, for the head of a report."""
     models = [line.partition(":")[2].strip() for line in _lines("/proc/cpuinfo") if line.startswith("model name")]
     return {
         "utc": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
@@ -33,6 +33,13 @@ def describe() -> dict[str, Any]:
         "uncommitted_files": len(_git("status", "--porcelain").splitlines()),
         "versions": library_versions(),
     }
+
+
+def describe_text(machine: dict[str, Any]) -> str:
+    """Formats the result of `describe` in one line."""
+    versions = ", ".join(f"{name} {version}" for name, version in machine["versions"].items())
+    changed = f" with {machine['uncommitted_files']} uncommitted files" if machine["uncommitted_files"] else ""
+    return f"{machine['utc']}, commit {machine['commit'] or 'unknown'}{changed}, {machine['cpu']}; {versions}"
 
 
 def _lines(path: str) -> list[str]:

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from birdslam.perf.reporting import plots
 from birdslam.perf.reporting.machine import ROOT
 from birdslam.runtime.latency import key_of
 
@@ -16,22 +15,18 @@ Benchmarks = Mapping[str, Mapping[str, Any]]
 
 
 def write(folder: Path, content: Mapping[str, Any]) -> None:
-    """`folder/report.md` and the plots beside it."""
-    drawn = plots.draw(folder, content["benchmarks"])
-    (folder / "report.md").write_text(markdown(content, drawn), encoding="utf-8")
+    """Writes `folder/report.md`."""
+    (folder / "report.md").write_text(markdown(content), encoding="utf-8")
 
 
-def markdown(content: Mapping[str, Any], drawn: Iterable[str] = ()) -> str:
-    """The report; `drawn` are files of plots."""
+def markdown(content: Mapping[str, Any]) -> str:
+    """Returns the report."""
     sections = [_head(content)]
     benchmarks: Benchmarks = content["benchmarks"]
     for title, section in SECTIONS:
         body = "\n".join(section(benchmarks))
         if body:
             sections.append(f"## {title}\n\n{body}")
-    pictures = [f"![{Path(name).stem.replace('_', ' ')}]({name})" for name in drawn]
-    if pictures:
-        sections.append("## Plots\n\n" + "\n\n".join(pictures))
     return "\n\n".join(sections).replace(str(ROOT.parent), "..") + "\n"
 
 
@@ -138,49 +133,6 @@ def _system(benchmarks: Benchmarks) -> Iterator[str]:
     )
 
 
-def _cores(benchmarks: Benchmarks) -> Iterator[str]:
-    rows = benchmarks.get("cores", {}).get("rows", [])
-    if rows:
-        yield "The source once, on the first so many cores by affinity:\n"
-        titles = ["on", "rate Hz", "dropped", "predicted", "age p50", "p99", "cores", "MB", "MB shared once"]
-        titles += ["seen in the frame", "reported", "ego ATE m"]
-        there = [row for row in rows if "missing" not in row]
-        yield from table(
-            titles,
-            (
-                [
-                    *(row["name"], row["rate_hz"], f"{row['dropped']} of {row['frames']}", row.get("predicted")),
-                    *_percentiles(row["age_ms"], ("p50", "p99")),
-                    *(row.get(name) for name in ("cpu_cores", "rss_mb", "pss_mb", "found", "reported", "ate_m")),
-                ]
-                for row in there
-            ),
-        )
-        missing = [f"- **{row['name']} is missing**: {row['missing']}" for row in rows if "missing" in row]
-        yield from ["", *missing] if missing else []
-
-
-def _accuracy(benchmarks: Benchmarks) -> Iterator[str]:
-    rows = [row for name in ("accuracy", "accuracy-data") for row in benchmarks.get(name, {}).get("rows", [])]
-    if rows:
-        titles = {
-            **{"frames": "frames", "dropped": "dropped", "ate_m": "ego ATE m", "ate_se3_m": "aligned"},
-            **{"scale_error": "scale error", "rpe_t_m": "RPE m", "rpe_r_deg": "RPE deg"},
-            **{"vehicle_ate_m": "vehicles' ATE m", "vehicle_centre_rel": "place, of the range"},
-            **{"found": "seen in the frame", "reported": "reported"},
-        }
-        there = [row for row in rows if "missing" not in row]
-        ages = (_percentiles(row.get("age_ms", {}), ("p50", "p99")) for row in there)
-        cells = ([row["name"], *(row.get(name) for name in titles), *age] for row, age in zip(there, ages, strict=True))
-        yield from table(("run", *titles.values(), "age p50", "p99"), cells)
-        missing = [f"- **{row['name']} is missing**: {row['missing']}" for row in rows if "missing" in row]
-        yield from ["", *missing] if missing else []
-        yield (
-            "\nThe demo's networks are the shipped ones, the recordings' those of the command. Frames that a live run "
-            "dropped hold the last pose. localisation and tracking read labelled boxes: no load changes them."
-        )
-
-
 def _optimizer(benchmarks: Benchmarks) -> Iterator[str]:
     titles = ("who", "vehicles", "frames", "p50 us", "p99", "p99.9", "max", "first 1000", "last 1000", "MB more")
     names = ("frames", "p50_us", "p99_us", "p999_us", "max_us", "first_thousand_p50_us", "last_thousand_p50_us")
@@ -220,14 +172,6 @@ _vehicles = _table_of(
     ],
     "The optimize process on the real bus, at the rate, with so many vehicles in sight:\n",
 )
-_inference = _table_of(
-    "inference",
-    ("what", "p50", "p99", "max", "prepare p50", "network p50", "read p50"),
-    lambda row: [
-        *(row["name"], *_percentiles(row["total_ms"], ("p50", "p99", "max"))),
-        *(row["parts_ms"].get(part, {}).get("p50") for part in ("prepare", "network", "read")),
-    ],
-)
 _transport = _table_of(
     "transport",
     ("case", "p50", "p99", "p99.9", "max", "cpu % send", "cpu % receive", "dropped", "steal %"),
@@ -247,10 +191,7 @@ _ratios = _table_of(
 
 SECTIONS = (
     ("The whole system", _system),
-    ("On fewer cores", _cores),
     ("Vehicles", _vehicles),
-    ("Accuracy, offline and live", _accuracy),
-    ("Networks and the perceive step", _inference),
     ("Optimizer", _optimizer),
     ("Ratios", _ratios),
     ("Transport", _transport),

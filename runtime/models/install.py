@@ -19,10 +19,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from birdslam.perception import ModelError, ModelSpec, load_network, shipped_manifests
+from birdslam.perception import ModelError, shipped_manifests
 from birdslam.perception.manifest_file import ManifestHeader, find_as
 from birdslam.runtime.models import store as model_store
-from birdslam.runtime.models.catalogue import Ir, catalogue, check_answers, converted
+from birdslam.runtime.models.catalogue import catalogue
 from birdslam.runtime.models.download import SCHEMES, download
 from birdslam.runtime.models.examine import examine
 from birdslam.runtime.progress import Progress
@@ -41,7 +41,6 @@ class Installation:
     manifest: str  # a path, an address, the name of a shipped one; "": found as for any network
     sha256: str  # "": what the manifest pins, or for a file of this machine what it has
     limit_bytes: int
-    ir: Ir | None = None  # where `source` is the XML of an OpenVINO IR
 
     @property
     def remote(self) -> bool:
@@ -61,12 +60,14 @@ def installation_of(source: str, name: str, manifest: str, sha256: str, limit_by
             raise ModelError(f"no model {source!r} in the catalogue, which has {', '.join(known.models)}; no such file")
         entry = known.models[source]
         if sha256 and sha256.lower() != entry.sha256:
-            raise ModelError(f"{source}: --sha256 {sha256} is not the catalogue's {entry.sha256 or 'own: it is made'}")
-        if entry.ir is not None and manifest:
-            raise ModelError(f"{source}: --manifest: it is made for the catalogue's own, {entry.manifest}")
+            raise ModelError(f"{source}: --sha256 {sha256} is not the catalogue's {entry.sha256}")
         size_bytes, address = min(entry.size_bytes, limit_bytes), known.address_of(entry)
         manifest = manifest or entry.manifest
-        return Installation(name or source, address, manifest, entry.sha256 or "", size_bytes, entry.ir)
+        return Installation(name or source, address, manifest, entry.sha256, size_bytes)
+    if source.endswith((".xml", ".bin")):
+        raise ModelError(
+            f"{source}: an OpenVINO IR is not read; convert it to ONNX with OpenVINO's tools, name that file"
+        )
     stem = Path(urlsplit(source).path if _is_address(source) else source).stem
     if not name and not model_store.is_name(stem):
         raise ModelError(f"{source}: {stem!r} is no name for a model: state one by --name")
@@ -82,21 +83,16 @@ def install(wanted: Installation, directory: Path) -> list[str]:
         made = scratch / wanted.name
         made.mkdir()
         network = made / f"{wanted.name}.onnx"
-        if wanted.ir is None:
-            _fetch(wanted.source, network, wanted.limit_bytes)
-        else:
-            network.write_bytes(_fetch_ir(wanted, wanted.ir, scratch))
+        _fetch(wanted.source, network, wanted.limit_bytes)
         has = hashlib.sha256(network.read_bytes()).hexdigest()
         if wanted.sha256 and has != wanted.sha256:
             raise ModelError(f"{wanted.source}: SHA-256 {has}, but {wanted.sha256} was expected: refused")
         text, pinned = _manifest_text(wanted, network, has, scratch)
-        if wanted.remote and not wanted.sha256 and wanted.ir is None and pinned != has:
+        if wanted.remote and not wanted.sha256 and pinned != has:
             raise ModelError(f"{wanted.source}: no SHA-256 is known for it: state it by --sha256 or in its manifest")
         network.with_suffix(".toml").write_text(text)
         try:
             lines = examine(network, "")
-            if wanted.ir is not None:
-                check_answers(wanted.ir, wanted.source, load_network("", ModelSpec(str(network))))
         except ModelError as error:  # named by where it came from, not by a place that is about to vanish
             raise ModelError(f"refused: {str(error).replace(str(network), wanted.source)}") from error
         target = directory / wanted.name
@@ -127,15 +123,6 @@ def _manifest_text(wanted: Installation, network: Path, sha256: str, scratch: Pa
             text = re.sub(r"(?m)^\s*sha256\s*=.*$", "", text, count=1)
         text = f'sha256 = "{sha256}"\n{text}'
     return text, manifest.sha256
-
-
-def _fetch_ir(wanted: Installation, ir: Ir, scratch: Path) -> bytes:
-    """The network of an IR: its XML and the .bin beside it fetched and converted."""
-    parts = scratch / "network.xml", scratch / "network.bin"
-    for part in parts:
-        _fetch(f"{wanted.source.removesuffix('.xml')}{part.suffix}", part, wanted.limit_bytes)
-    xml, weights = (part.read_bytes() for part in parts)
-    return converted(ir, wanted.source, wanted.manifest, xml, weights)
 
 
 def _fetch(source: str, target: Path, limit_bytes: int) -> None:

@@ -9,8 +9,6 @@ import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
-from birdslam.perf.errors import PerfError
-
 LIMIT_S = 300.0
 VIRTUAL_MS = 8000  # of the page's own clock, which runs as fast as there is work
 SOFTWARE_GL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
@@ -39,10 +37,10 @@ def look(
     virtual_ms: int | None = VIRTUAL_MS,
     more: tuple[str, ...] = (),
 ) -> Seen:
-    """Opens a page and takes its picture (PNG). Raises PerfError where there is no browser, or it fails."""
+    """Opens a page and takes its picture (PNG). Raises RuntimeError where there is no browser, or it fails."""
     program = chromium()
     if program is None:
-        raise PerfError("no Chromium (Debian: apt install chromium)")
+        raise RuntimeError("no Chromium (Debian: apt install chromium)")
     scheme, size = f"--blink-settings=preferredColorScheme={int(not dark)}", "{},{}".format(*size_px)
     command = [
         *(program, "--headless", "--no-sandbox", "--enable-logging=stderr", "--hide-scrollbars", "--dump-dom"),
@@ -53,7 +51,7 @@ def look(
     ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=False)
     if done.returncode or not picture.is_file():
-        raise PerfError(f"{url}: {done.stderr[-1000:]}")
+        raise RuntimeError(f"{url}: {done.stderr[-1000:]}")
     root = re.search("<html[^>]*>", done.stdout)
     said = dict(re.findall(r'data-([\w-]+)="([^"]*)"', root[0])) if root else {}
     console = [line for line in done.stderr.splitlines() if "CONSOLE" in line]

@@ -1,8 +1,8 @@
 """The other side at a router, by the independent package zenoh-ros2-sdk, and a router as rmw_zenoh's is.
 
-    python -m birdslam.perf.ros2.ros_peer router PORT                       until its input ends
-    python -m birdslam.perf.ros2.ros_peer hear PORT DOMAIN TOPIC=TYPE...    a JSON line a message, until then
-    python -m birdslam.perf.ros2.ros_peer car PORT DOMAIN URI HZ            a recording round and round; images' times
+    python -m tests.ros_peer router PORT                       until its input ends
+    python -m tests.ros_peer hear PORT DOMAIN TOPIC=TYPE...    a JSON line a message, until then
+    python -m tests.ros_peer car PORT DOMAIN URI HZ            a recording round and round; images' times
 
 Each says "ready". The package reads definitions of messages from files, written here from what rosbags knows.
 """
