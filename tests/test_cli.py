@@ -141,7 +141,7 @@ def test_frames_that_cannot_be_compared_are_one_line(
     ("options", "reason"),
     [
         (("--source", "demo", "--camera", "CAMERA", "--height", "1.4"), "a camera is given"),
-        (("--source", "v4l2:/dev/video9", "--height", "1.4"), "can't be seen twice"),
+        (("--source", "v4l2:/dev/video9", "--height", "1.4"), "is live and has no first pass"),
         (("--source", "video:FILM", "--height", "1.4", "--fov", "3"), "--fov 3: is no field of view"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Arguments that several commands have in common."""
+"""Arguments that several commands share."""
 
 from __future__ import annotations
 
@@ -9,105 +9,108 @@ RECORDING = "FILE.mcap"
 
 
 def add_pipeline(parser: argparse.ArgumentParser) -> None:
-    """The pipeline of a drive: networks, camera, stride, results, any key."""
+    """Adds networks, camera, stride, output folder and settings."""
     parser.add_argument(
         "--model",
         action="append",
         default=[],
         metavar="[ROLE=]PATH|NAME",
-        help="an ONNX network for a role (detector, segmenter, depth, multitask), or a model's name; may be repeated; "
-        "without both a detector and a segmenter the shipped network fills in, unless `none` is named",
+        help="ONNX network for a role (detector, segmenter, depth, multitask), or name of a model; repeatable; "
+        "the shipped network takes the roles that are missing, unless `none` is given",
     )
-    parser.add_argument("--camera", metavar="FILE", help="a camera file (TOML) instead of the recording's calibration")
-    parser.add_argument("--stride", type=int, metavar="N", help="every N-th frame of a recording")
-    parser.add_argument("--output", metavar="DIR", help="where results go")
-    add_settings(parser, "a key of docs/configuration.md, e.g. perceive.deadline_ms=25")
+    parser.add_argument(
+        "--camera", metavar="FILE", help="camera file (TOML), replaces the calibration of the recording"
+    )
+    parser.add_argument("--stride", type=int, metavar="N", help="read every N-th frame of a recording")
+    parser.add_argument("--output", metavar="DIR", help="folder of the results")
+    add_settings(parser, "set a key of docs/configuration.md, e.g. perceive.deadline_ms=25")
 
 
 def add_other_odometry(parser: argparse.ArgumentParser, metavar: str) -> None:
-    """A trajectory in place of our own odometry."""
-    text = "another odometry in place of the images': TUM lines or KITTI rows, in metres"
-    text += "; DIR: NAME.txt of each sequence" * ("DIR" in metavar)
+    """Adds an external trajectory that replaces the visual odometry."""
+    text = "external trajectory that replaces the visual odometry: TUM lines or KITTI rows, in metres"
+    text += "; DIR: NAME.txt for each sequence" * ("DIR" in metavar)
     parser.add_argument("--odometry", dest="other_odometry", metavar=metavar, help=text)
 
 
 def add_detections(parser: argparse.ArgumentParser) -> None:
-    """Boxes of another detector in place of a network's."""
-    text = "another detector's boxes over a recording: MOT challenge text, KITTI tracking text, or COCO results"
+    """Adds a file of boxes that replaces the detector."""
+    text = "boxes of another detector: MOT challenge text, KITTI tracking text, or COCO results"
     parser.add_argument("--detections", dest="other_detections", metavar="FILE", help=text)
 
 
 def add_speeds(parser: argparse.ArgumentParser) -> None:
-    """The car's own speed, of one drive or of several."""
-    parser.add_argument("--speed", metavar="FILE|DIR", help="the car's own speed; DIR: NAME.txt of each sequence")
+    """Adds the speed of the vehicle, for one drive or several."""
+    parser.add_argument("--speed", metavar="FILE|DIR", help="speed of the vehicle; DIR: NAME.txt for each sequence")
 
 
 def add_topics(parser: argparse.ArgumentParser, *more: str) -> None:
-    """Of a ROS bag; `more` are what else may be read from it: speed, truth."""
-    parser.add_argument("--topic", metavar="TOPIC", help="of a ROS bag's images, where it has several")
-    parser.add_argument("--camera-info-topic", metavar="TOPIC", help="of a ROS bag's camera")
+    """Adds the topics of a ROS bag; `more` names optional ones: speed, truth."""
+    parser.add_argument("--topic", metavar="TOPIC", help="image topic of a ROS bag that has several")
+    parser.add_argument("--camera-info-topic", metavar="TOPIC", help="CameraInfo topic of a ROS bag")
     if "speed" in more:
-        text = "the car's own speed in a ROS bag: TwistStamped, TwistWithCovarianceStamped or Odometry"
+        text = "speed topic of a ROS bag: TwistStamped, TwistWithCovarianceStamped or Odometry"
         parser.add_argument("--speed-topic", metavar="TOPIC", help=text)
     if "truth" in more:
-        text = "true poses in a ROS bag: nav_msgs/Odometry or sensor_msgs/NavSatFix"
+        text = "ground truth topic of a ROS bag: nav_msgs/Odometry or sensor_msgs/NavSatFix"
         parser.add_argument("--truth-topic", metavar="TOPIC", help=text)
 
 
 def add_final_results(parser: argparse.ArgumentParser) -> None:
-    """What is written when a drive is over."""
-    text = "also write the final trajectories, by the RTS smoother: tracks/ID.final.tum.txt, ego.final.*"
+    """Adds what is written after a drive."""
+    text = "also write smoothed trajectories (RTS smoother): tracks/ID.final.tum.txt, ego.final.*"
     parser.add_argument("--smooth", action="store_true", default=None, help=text)
-    text = "draw the frames with the estimated boxes beside the bird's-eye view, when the drive is over"
+    text = "write a video of the frames with boxes beside the bird's-eye view, after the drive"
     parser.add_argument("--video", metavar="FILE.mp4", help=text)
 
 
 def add_map(parser: argparse.ArgumentParser) -> None:
-    """The map of places that a drive is localised in."""
+    """Adds the map in which a drive is localized, and GNSS."""
     which = parser.add_mutually_exclusive_group()
-    text = "a map of places: the drive is localised in it and makes it longer, or begins it; OUTPUT/map.tum.txt"
+    text = "localize the drive in this map and extend it; a missing file is created; OUTPUT/map.tum.txt"
     which.add_argument("--map", metavar="FILE", help=text)
-    which.add_argument("--map-only", metavar="FILE", help="localised in this map, which stays as it is")
-    which.add_argument("--no-map", action="store_true", help="whatever the configuration says: for small computers")
+    which.add_argument("--map-only", metavar="FILE", help="localize the drive in this map, do not change it")
+    which.add_argument("--no-map", action="store_true", help="use no map, whatever the configuration names")
     text = (
         "GNSS fixes: a file (CSV, NMEA, GPX), topic:/NAME of a ROS bag, or a receiver /dev/TTY[@BAUD]; "
-        "the drive's way, and the map, on Earth: ego.geojson, ego.gpx, ego.kml"
+        "georeferences trajectory and map: ego.geojson, ego.gpx, ego.kml"
     )
     parser.add_argument("--gnss", metavar="FILE", help=text)
 
 
 def add_vehicle(parser: argparse.ArgumentParser) -> None:
-    """Which vehicle on the bus."""
+    """Adds the name of the vehicle on the bus."""
     parser.add_argument("--vehicle", metavar="NAME", default="car")
-    parser.add_argument("--runtime-dir", metavar="DIR", type=Path, help="as runtime.runtime_dir of the run")
+    parser.add_argument("--runtime-dir", metavar="DIR", type=Path, help="runtime.runtime_dir of the run")
 
 
 def add_fleet(parser: argparse.ArgumentParser) -> None:
-    """All vehicles of a fleet in place of one."""
-    text = "all vehicles at the router that this file names in [fleet]"
+    """Adds the choice of all vehicles of a fleet."""
+    text = "show all vehicles of the router that this file names in [fleet]"
     parser.add_argument("--all", type=Path, metavar="CONFIG.toml", help=text)
 
 
 def add_config(parser: argparse.ArgumentParser) -> None:
-    """A configuration file."""
-    parser.add_argument("--config", type=Path, metavar="CONFIG.toml", help="differences from the defaults")
+    """Adds a configuration file."""
+    text = "configuration file: differences from the defaults"
+    parser.add_argument("--config", type=Path, metavar="CONFIG.toml", help=text)
 
 
-def add_settings(parser: argparse.ArgumentParser, text: str = "a key of docs/configuration.md") -> None:
-    """Single keys of the configuration, and for developers the constants beside them."""
+def add_settings(parser: argparse.ArgumentParser, text: str = "set a key of docs/configuration.md") -> None:
+    """Adds single keys of the configuration, and constants for developers."""
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help=text)
-    text = "for developers: any field of the typed configuration, e.g. slam.graph.ego_nodes=8"
+    text = "for developers: set any field of the typed configuration, e.g. slam.graph.ego_nodes=8"
     parser.add_argument("--constant", action="append", default=[], metavar="KEY=VALUE", help=text)
 
 
 def add_tracking_root(parser: argparse.ArgumentParser) -> None:
-    """A KITTI tracking folder and its sequences."""
-    parser.add_argument("root", type=Path, metavar="ROOT", help="KITTI tracking: calib, label_02, oxts, ...")
-    parser.add_argument("--sequences", metavar="N,N", help="e.g. 0002,0003; default: all at hand")
+    """Adds a KITTI tracking folder and its sequences."""
+    parser.add_argument("root", type=Path, metavar="ROOT", help="folder of KITTI tracking: calib, label_02, oxts, ...")
+    parser.add_argument("--sequences", metavar="N,N", help="e.g. 0002,0003; default: all that exist")
 
 
 def add_lens(parser: argparse.ArgumentParser) -> None:
-    """What is known of the lens of a film that says nothing of its camera."""
-    text = "how wide the camera sees, across, where nothing tells its lens"
+    """Adds the field of view of a film without a camera file."""
+    text = "horizontal field of view, for a film whose metadata do not have it"
     parser.add_argument("--fov", type=float, metavar="DEG", help=text)
-    parser.add_argument("--kind", choices=("dashcam", "phone"), default="dashcam", help="which, where --fov is unknown")
+    parser.add_argument("--kind", choices=("dashcam", "phone"), default="dashcam", help="if --fov is unknown")

@@ -1,4 +1,4 @@
-"""What a user can mend: each of these is one line on standard error, and exit status 2."""
+"""Errors of the user: each is one line on standard error, and exit status 2."""
 
 from birdslam.calibration.calibration import CalibrationError
 from birdslam.loops.gnss.earth import EarthError

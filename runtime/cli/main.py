@@ -1,4 +1,4 @@
-"""The command `birdslam`. What a user can mend is one line on standard error and exit status 2, never a traceback."""
+"""The command `birdslam`. An error of the user is one line on standard error and exit status 2, never a traceback."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from birdslam.runtime.environment import CLOSED_PIPE_STATUS, ENVIRONMENT, INTERR
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Entry point; gives the exit status."""
-    os.environ.update(ENVIRONMENT)  # before anything loads numpy, whose libraries read it then
+    """Entry point; returns the exit status."""
+    os.environ.update(ENVIRONMENT)  # numpy reads it on import
     options = parse(sys.argv[1:] if arguments is None else arguments)
     from birdslam.runtime.cli.errors import USER_ERRORS
 
@@ -22,7 +22,7 @@ def main(arguments: list[str] | None = None) -> int:
         return USER_ERROR_STATUS
     except KeyboardInterrupt:
         return INTERRUPTED_STATUS
-    except BrokenPipeError:  # `| head` has seen enough; Python would complain once more when it flushes
+    except BrokenPipeError:  # `| head`; Python would complain again on its last flush
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return CLOSED_PIPE_STATUS
 

@@ -1,4 +1,4 @@
-"""`birdslam run`: the three processes on a source; of a film without a camera file a first pass finds its camera."""
+"""`birdslam run`: runs the three processes on a source; a first pass calibrates a film that has no camera file."""
 
 from __future__ import annotations
 
@@ -31,31 +31,32 @@ from birdslam.sources.schemes import VIDEO, scheme_of
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Source, rate, recording and results, and the pipeline."""
+    """Adds source, rate, recording, results and pipeline."""
     parser.epilog = sources_note()
-    parser.add_argument("config", nargs="?", type=Path, metavar="CONFIG.toml", help="differences from the defaults")
-    parser.add_argument("--source", metavar="URI", help="where frames come from")
-    parser.add_argument("--rate", metavar="HZ|max", help='frames a second, or "max": every frame, as fast as can be')
-    parser.add_argument("--vehicle", metavar="NAME", help="its name on the bus")
-    parser.add_argument("--record", metavar="FILE.mcap", help="record the drive; a directory: a new file in it")
-    parser.add_argument("--record-images", action="store_true", default=None, help="with its frames, as JPEG")
+    text = "configuration file: differences from the defaults"
+    parser.add_argument("config", nargs="?", type=Path, metavar="CONFIG.toml", help=text)
+    parser.add_argument("--source", metavar="URI", help="source of the frames")
+    parser.add_argument("--rate", metavar="HZ|max", help='frames per second; "max": every frame, as fast as possible')
+    parser.add_argument("--vehicle", metavar="NAME", help="name of the vehicle on the bus")
+    parser.add_argument("--record", metavar="FILE.mcap", help="record the drive to a file; DIR: to a new file in it")
+    parser.add_argument("--record-images", action="store_true", default=None, help="also record the frames, as JPEG")
     add_final_results(parser)
     add_map(parser)
-    text = "the car's own speed over a recording: time in s, speed in m/s, or a GPS table with named columns"
+    text = "speed of the vehicle during a recording: time in s, speed in m/s, or a GPS table with named columns"
     parser.add_argument("--speed", metavar="FILE", help=text)
     add_other_odometry(parser, "FILE")
     add_detections(parser)
     add_topics(parser, "speed")
-    text = "the camera's height over the road, for a film without --camera; left out, cars and lanes seen give it"
+    text = "height of the camera above the road; without it car sizes and lane widths give the scale"
     parser.add_argument("--height", type=float, metavar="M", help=text)
     add_lens(parser)
-    text = "fetch the networks that real roads want, once, without asking"
+    text = "download the networks for real roads without asking"
     parser.add_argument("--yes", action="store_true", help=text)
     add_pipeline(parser)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Runs until the source ends; gives the exit status."""
+    """Runs until the source ends and returns the exit status."""
     configuration = configuration_of(options)
     scheme = scheme_of(configuration.source.uri, all_schemes())
     if scheme is VIDEO and not options.model and not configuration.models.given() and configuration.models.shipped:
@@ -68,7 +69,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _networks(configuration: Configuration, fetch_them: bool) -> tuple[str, ...]:
-    """Names of the networks for real roads that are installed, once somebody who may have the others was asked."""
+    """Returns the names of the installed networks for real roads, after offering to download the others."""
     directory = models_directory(configuration.runtime.models_dir)
     found = recommended(directory)
     if not found.missing:
@@ -78,32 +79,34 @@ def _networks(configuration: Configuration, fetch_them: bool) -> tuple[str, ...]
     elif not fetch_them:
         missing = " ".join(found.missing)
         print(
-            f"birdslam: networks for real roads are not installed (--yes fetches {missing}): the shipped one looks for "
-            "vehicles, and finds fewer",
+            f"birdslam: the networks for real roads are not installed ({missing}); the shipped network finds fewer "
+            "vehicles. --yes downloads them",
             file=sys.stderr,
         )
     if fetch_them:
         try:
             fetch(tuple(found.missing), directory)
         except (DownloadError, ModelError) as error:
-            print(f"birdslam: {error}; the shipped network looks for vehicles", file=sys.stderr)
+            print(f"birdslam: {error}; the shipped network detects vehicles", file=sys.stderr)
     return recommended(directory).at_hand
 
 
 def _calibrated(configuration: Configuration, options: argparse.Namespace) -> tuple[Configuration, LengthsBy]:
-    """With the camera that a first pass over the film finds, whose file lies with the results; and what its lengths
-    rest on."""
-    # Only where it is asked for: the whole front end comes with it
+    """Returns the configuration with the camera estimated by a first pass, and what its scale rests on.
+
+    Writes the camera file beside the results.
+    """
+    # A late import: it loads the whole front end
     from birdslam.runtime.calibration.drive import ROUGH, calibrate_drive
     from birdslam.runtime.calibration.given import Given
     from birdslam.runtime.calibration.report import write_camera_file
 
     source = configuration.source
     if configuration.camera is not None:
-        raise ConfigurationError("--height: a camera is given, which has a height of its own")
+        raise ConfigurationError("--height: the camera file has a height already; leave --height out or edit the file")
     if is_live(source.uri):
         raise ConfigurationError(
-            f"--height: {source.uri} can't be seen twice: `birdslam calibrate` a film of this camera"
+            f"--height: {source.uri} is live and has no first pass; run `birdslam calibrate` on a film of this camera"
         )
     speed = Path(source.speed).expanduser() if source.speed else None
     given = Given(height_m=options.height, fov_deg=options.fov, kind=options.kind, speed=speed)
@@ -111,6 +114,6 @@ def _calibrated(configuration: Configuration, options: argparse.Namespace) -> tu
     path = Path(configuration.output) / "camera.toml"
     write_camera_file(path, found.camera, found.report)
     print("\n".join((*found.report, f"camera file: {path}")), flush=True)
-    if source.rate is None:  # nobody drives by a film that was seen before
+    if source.rate is None:  # a film has no real time
         source = msgspec.structs.replace(source, rate="max")
     return msgspec.structs.replace(configuration, camera=found.camera, source=source), found.lengths_by
