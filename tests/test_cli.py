@@ -140,7 +140,7 @@ def test_frames_that_cannot_be_compared_are_one_line(
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        (("--source", "demo", "--camera", "CAMERA", "--height", "1.4"), "a camera is given"),
+        (("--source", "demo", "--camera", "CAMERA", "--height", "1.4"), "the camera file has a height already"),
         (("--source", "v4l2:/dev/video9", "--height", "1.4"), "is live and has no first pass"),
         (("--source", "video:FILM", "--height", "1.4", "--fov", "3"), "--fov 3: is no field of view"),
     ],
