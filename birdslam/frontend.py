@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from birdslam.geometry.arrays import Bools, Floats, Ints
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
-from birdslam.mapping.landmark_edges import StaticMapConfig, landmark_edges
-from birdslam.mapping.lane_edges import LaneEdgesConfig
-from birdslam.mapping.lane_mapper import LaneHead, LaneMapper, LaneOutput
-from birdslam.mapping.lanes import LanesConfig, LaneView
+from birdslam.lanes.amodal.landmark_edges import StaticMapConfig, landmark_edges
+from birdslam.lanes.amodal.lane_edges import LaneEdgesConfig
+from birdslam.lanes.amodal.lane_mapper import LaneHead, LaneMapper, LaneOutput
+from birdslam.lanes.amodal.lanes import LanesConfig, LaneView
 from birdslam.odometry.dead_reckoning import DeadReckoning
 from birdslam.odometry.external import ExternalConfig
 from birdslam.odometry.odometry import Motion, Odometry, OdometryConfig

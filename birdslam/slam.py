@@ -11,7 +11,7 @@ from birdslam.geometry.camera import Camera
 from birdslam.graph.graph_config import GraphConfig, check_together
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
-from birdslam.mapping.lane_mapper import LaneHead
+from birdslam.lanes.amodal.lane_mapper import LaneHead
 from birdslam.perception import Networks, shipped_networks
 from birdslam.perception.completion import shipped_completion
 from birdslam.perception.decoding.detection import Detections

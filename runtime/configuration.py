@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from birdslam.geometry.camera import Camera
-from birdslam.mapping.atlas import AtlasConfig
+from birdslam.lanes.amodal.atlas import AtlasConfig
 from birdslam.paper import PAPER
 from birdslam.perception import ModelError, ModelSpec
 from birdslam.runtime.fields import differences, laid_over, leaves, why_no_key

@@ -17,7 +17,7 @@ from birdslam.geometry.se2 import SE2
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
-from birdslam.mapping.atlas import Atlas, AtlasConfig
+from birdslam.lanes.amodal.atlas import Atlas, AtlasConfig
 from birdslam.queries import MapSnapshot, Trajectory
 from birdslam.types import Estimate, MapUpdate, VehicleEstimate
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from birdslam.mapping.lanes import BOUNDARY, ROAD, LanesConfig
+from birdslam.lanes.amodal.lanes import BOUNDARY, ROAD, LanesConfig
 from birdslam.perception.completion import SHIPPED, GridCompletion
 from birdslam.perception.manifest import ModelError
 from tests.tiny_networks import echo

@@ -11,7 +11,7 @@ from birdslam.frontend import FrontEnd, FrontEndConfig
 from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera, GroundPlane, VerticalCurvature
 from birdslam.geometry.se2 import SE2
-from birdslam.mapping.lane_mapper import LaneMapper
+from birdslam.lanes.amodal.lane_mapper import LaneMapper
 from birdslam.odometry.dead_reckoning import DeadReckoning
 from birdslam.odometry.odometry import Motion
 from birdslam.perception import Detections, Perception, Ready, Segmentation

@@ -10,7 +10,7 @@ from birdslam.bench.lanes.hidden_cells import HiddenCells
 from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
-from birdslam.mapping.lanes import ROAD, LanesConfig
+from birdslam.lanes.amodal.lanes import ROAD, LanesConfig
 from birdslam.perception import Segmentation
 
 CAMERA = Camera(fx_px=400.0, fy_px=400.0, cx_px=320.0, cy_px=120.0, width_px=640, height_px=240, height_m=1.5)

@@ -15,7 +15,7 @@ from birdslam.geometry.se2 import SE2
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig, weighted
-from birdslam.mapping.lane_edges import LaneEdgesConfig, Station, lane_stations, stations
+from birdslam.lanes.amodal.lane_edges import LaneEdgesConfig, Station, lane_stations, stations
 from birdslam.types import EgoEdge, Estimate, LandmarkEdge, LandmarkKind, Measurements
 
 CONFIG = LaneEdgesConfig()

@@ -12,10 +12,10 @@ import pytest
 from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
-from birdslam.mapping.landmark_edges import StaticMapConfig
-from birdslam.mapping.lane_edges import LaneEdgesConfig
-from birdslam.mapping.lane_mapper import LaneHead, LaneMapper, LaneOutput
-from birdslam.mapping.lanes import Grids
+from birdslam.lanes.amodal.landmark_edges import StaticMapConfig
+from birdslam.lanes.amodal.lane_edges import LaneEdgesConfig
+from birdslam.lanes.amodal.lane_mapper import LaneHead, LaneMapper, LaneOutput
+from birdslam.lanes.amodal.lanes import Grids
 from birdslam.perception import Segmentation
 from birdslam.types import LandmarkKind, Status
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from birdslam.geometry.se2 import SE2
-from birdslam.mapping.lanes import BOUNDARY, AmodalLanes, Grids, LanesConfig, lane_view
+from birdslam.lanes.amodal.lanes import BOUNDARY, AmodalLanes, Grids, LanesConfig, lane_view
 from birdslam.outputs.lane_picture import draw_lanes
 from birdslam.runtime.cli.main import main
 

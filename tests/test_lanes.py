@@ -11,8 +11,8 @@ from birdslam.geometry import bev
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
-from birdslam.mapping.lane_ids import LaneCloud
-from birdslam.mapping.lanes import (
+from birdslam.lanes.amodal.lane_ids import LaneCloud
+from birdslam.lanes.amodal.lanes import (
     BOUNDARY,
     ROAD,
     AmodalLanes,

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from birdslam.geometry.se2 import SE2
-from birdslam.mapping.atlas import Atlas
+from birdslam.lanes.amodal.atlas import Atlas
 from birdslam.queries import MapSnapshot, TimedPose, Trajectory, VehiclePath
 from birdslam.runtime.client import Planner
 from birdslam.runtime.configuration import Configuration, SourceConfig

@@ -37,7 +37,7 @@ from birdslam.frontend import FrontEnd, FrontEndConfig
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.weights import weighted
-from birdslam.mapping.landmark_edges import StaticMapConfig
+from birdslam.lanes.amodal.landmark_edges import StaticMapConfig
 from birdslam.perception import Perception, Ready
 from birdslam.runtime.cli.commands import parse
 from birdslam.runtime.cli.evaluate.tracking import evaluate

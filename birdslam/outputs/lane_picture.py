@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.arrays import Floats32
-from birdslam.mapping.lanes import BOUNDARY, ROAD, LanesConfig, LaneView
+from birdslam.lanes.amodal.lanes import BOUNDARY, ROAD, LanesConfig, LaneView
 
 TITLES = (
     "lane boundary, seen",

@@ -15,7 +15,7 @@ from typing import Any
 
 from birdslam.frontend import Pending
 from birdslam.geometry.camera import Camera
-from birdslam.mapping.lane_mapper import LaneHead
+from birdslam.lanes.amodal.lane_mapper import LaneHead
 from birdslam.perception import Detections, ModelSpec, Networks, Perception, Ready, load_network
 from birdslam.perception.completion import GridCompletion, shipped_completion
 from birdslam.perception.manifest import Role

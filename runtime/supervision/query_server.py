@@ -8,7 +8,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Mapping, Sequence
 
-from birdslam.mapping.atlas import Atlas
+from birdslam.lanes.amodal.atlas import Atlas
 from birdslam.queries import MapSnapshot, Nearby, Trajectory, nearby
 from birdslam.runtime.configuration import Configuration, without_passwords
 from birdslam.runtime.transport.bus import Bus

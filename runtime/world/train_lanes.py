@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from birdslam.mapping.lanes import LanesConfig
+from birdslam.lanes.amodal.lanes import LanesConfig
 from birdslam.perception.completion import SHIPPED
 from birdslam.runtime.process.workers import workers
 from birdslam.world.training.lanes import ENet, LaneSamplesConfig, loss, samples

@@ -17,7 +17,7 @@ from birdslam.geometry import bev
 from birdslam.geometry.arrays import Bools, Floats, Floats32, Ints
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
-from birdslam.mapping.lanes import (
+from birdslam.lanes.amodal.lanes import (
     BOUNDARY,
     ROAD,
     AmodalLanes,

@@ -22,7 +22,7 @@ from birdslam.geometry.arrays import Bools, Floats
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.pose import Pose
 from birdslam.geometry.se2 import SE2
-from birdslam.mapping.landmark_edges import StaticMapConfig, landmark_edges
+from birdslam.lanes.amodal.landmark_edges import StaticMapConfig, landmark_edges
 from birdslam.odometry.external import WithoutImages
 from birdslam.odometry.motion import Motion, planar
 from birdslam.trajectory import Transform, inverse

@@ -27,7 +27,7 @@ from birdslam.geometry.se2 import SE2
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
-from birdslam.mapping.lane_mapper import LaneHead
+from birdslam.lanes.amodal.lane_mapper import LaneHead
 from birdslam.paper import PAPER as AS_PUBLISHED
 from birdslam.slam import SlamConfig
 from birdslam.sources.kitti import KITTI_RATE_HZ

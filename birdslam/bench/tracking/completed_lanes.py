@@ -14,7 +14,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from birdslam.bench.baselines.trajectories import dead_reckoned
-from birdslam.mapping.lane_edges import LaneEdgesConfig, Station, stations
+from birdslam.lanes.amodal.lane_edges import LaneEdgesConfig, Station, stations
 from birdslam.types import LandmarkKind, Measurements
 
 # Points of the completed lanes are thinned to one a cell, a few on a station's stretch

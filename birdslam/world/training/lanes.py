@@ -19,7 +19,7 @@ from torch.nn import functional
 from birdslam.geometry.arrays import Floats, Floats32
 from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.se2 import SE2
-from birdslam.mapping.lanes import AmodalLanes, LanesConfig, points_of
+from birdslam.lanes.amodal.lanes import AmodalLanes, LanesConfig, points_of
 from birdslam.perception import Segmentation
 from birdslam.world.truth import CLASSES, WorldFrame
 

@@ -22,7 +22,7 @@ import numpy as np
 from birdslam.geometry.arrays import Bools, Floats, Floats32, Ints
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
-from birdslam.mapping.lane_ids import LaneCloud, LaneIds
+from birdslam.lanes.amodal.lane_ids import LaneCloud, LaneIds
 from birdslam.perception import Segmentation
 
 Points = Floats32  # (N, 1, 2), as OpenCV takes them: x and y

@@ -20,13 +20,13 @@ from birdslam.geometry import bev
 from birdslam.geometry.arrays import Floats, Ints
 from birdslam.geometry.camera import Camera, GroundPlane, VerticalCurvature
 from birdslam.geometry.se2 import SE2
+from birdslam.lanes.amodal.landmark_edges import StaticMapConfig
+from birdslam.lanes.amodal.lane_edges import LaneEdgesConfig, Station, lane_stations
+from birdslam.lanes.amodal.lane_ids import NO_LANE, cell_keys
+from birdslam.lanes.amodal.lanes import AmodalLanes, Completion, LanesConfig, LaneView, lane_view, points_of
 from birdslam.lanes.ego_lane import EgoLane
 from birdslam.lanes.line_tracker import LineTracker
 from birdslam.lanes.tracked_lines import TrackedLines
-from birdslam.mapping.landmark_edges import StaticMapConfig
-from birdslam.mapping.lane_edges import LaneEdgesConfig, Station, lane_stations
-from birdslam.mapping.lane_ids import NO_LANE, cell_keys
-from birdslam.mapping.lanes import AmodalLanes, Completion, LanesConfig, LaneView, lane_view, points_of
 from birdslam.perception import Segmentation
 from birdslam.types import LandmarkEdge, LanePoint, Lanes, Status
 
