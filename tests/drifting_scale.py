@@ -10,7 +10,7 @@ from birdslam.bench.simulation.places import block
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.closing import close_loops
-from birdslam.loops.drift import CORRELATION_M, LEAST_SCALE_REL, link_cov
+from birdslam.loops.drift import CORRELATION_M, MIN_SCALE_REL, link_cov
 from birdslam.loops.gnss.factors import Node
 from birdslam.loops.keyframe import Link
 
@@ -25,7 +25,7 @@ def carried(seed: int, drift: float) -> Drive:
     """Simulates a round and its beginning again; the scale has the errors of odometry, then drifts."""
     chance = np.random.default_rng([seed, 1])
     way_m = np.arange(0.0, ROUND_M + AGAIN_M, STEP_M)
-    lasts, error = math.exp(-STEP_M / CORRELATION_M), LEAST_SCALE_REL * chance.standard_normal(len(way_m))
+    lasts, error = math.exp(-STEP_M / CORRELATION_M), MIN_SCALE_REL * chance.standard_normal(len(way_m))
     for k in range(1, len(error)):
         error[k] = lasts * error[k - 1] + math.sqrt(1.0 - lasts**2) * error[k]
     drifted = drift * np.clip((way_m - CARRIED_FROM_M) / (ROUND_M - CARRIED_FROM_M), 0.0, None)
@@ -44,7 +44,7 @@ def _drive(seed: int, scales: Floats, drifted: Floats) -> Drive:
         step = _measured(true[k - 1].between(true[k]), scales[k], chance.standard_normal(3) * STEP_SIGMA)
         T_odom = T_odom @ step
         odometry.append(T_odom)
-        scale_rel = math.hypot(LEAST_SCALE_REL, drifted[k])
+        scale_rel = math.hypot(MIN_SCALE_REL, drifted[k])
         links.append(Link(k - 1, k, step, link_cov(step, scale_rel), scale_rel=scale_rel))
     round_, cov = len(route) // STEP_M, np.diag(np.square(LOOP_SIGMA))
     for k in range(round_ + 2, len(true), 2):

@@ -20,8 +20,8 @@ ONLY_IN = {  # third-party library: the packages that may import it
     "rosbags": {"ros"},
     "zenoh": {"runtime.transport", "runtime.gate", "runtime.fleet", "runtime.ros", "perf"},
 }
-MOST_MODULES = 15  # in a folder
-MOST_LINES_OF_HEAD = 8
+MAX_MODULES = 15  # in a folder
+MAX_LINES_OF_HEAD = 8
 
 
 def modules() -> dict[str, Path]:
@@ -138,7 +138,7 @@ FOLDERS_OF_MODULES = sorted({path.parent for path in MODULES.values()})
 
 @pytest.mark.parametrize("folder", FOLDERS_OF_MODULES, ids=lambda folder: str(folder.relative_to(ROOT)))
 def test_a_folder_holds_few_modules(folder: Path) -> None:
-    assert len([path for path in folder.glob("*.py") if path.name != "__init__.py"]) <= MOST_MODULES
+    assert len([path for path in folder.glob("*.py") if path.name != "__init__.py"]) <= MAX_MODULES
 
 
 LONGER_HEAD = {"birdslam.types"}  # its head is the section of frames and units of docs/planner.md
@@ -147,7 +147,7 @@ LONGER_HEAD = {"birdslam.types"}  # its head is the section of frames and units 
 def test_the_head_of_a_module_is_at_most_eight_lines() -> None:
     for module, path in MODULES.items():
         head = ast.get_docstring(ast.parse(path.read_text())) or ""
-        assert len(head.splitlines()) <= MOST_LINES_OF_HEAD or module in LONGER_HEAD, module
+        assert len(head.splitlines()) <= MAX_LINES_OF_HEAD or module in LONGER_HEAD, module
 
 
 def test_no_machine_path_or_secret_host_in_the_tree() -> None:

@@ -19,7 +19,7 @@ from birdslam.runtime.batch import drive as driving
 from birdslam.runtime.batch.drive import DRIVES, DriveResult, Failure, Job, done, failure_file, run_drive
 from birdslam.runtime.batch.drives import Task, find_drives, sweep, tasks
 from birdslam.runtime.batch.local import run_local
-from birdslam.runtime.batch.report import MOST_BARS, write_report
+from birdslam.runtime.batch.report import MAX_BARS, write_report
 from birdslam.runtime.cli.main import main
 from birdslam.runtime.configuration import ConfigurationError
 
@@ -179,7 +179,7 @@ def result(task: Task, number: int) -> DriveResult:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("count", [3, MOST_BARS + 1])
+@pytest.mark.parametrize("count", [3, MAX_BARS + 1])
 def test_the_report_lists_every_drive(tmp_path: Path, count: int) -> None:
     drive = kitti(tmp_path / "00", 1)
     (one,) = made([drive])

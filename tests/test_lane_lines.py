@@ -24,14 +24,14 @@ from birdslam.lanes.curves import basis, moved
 from birdslam.lanes.ego_lane import EgoLane
 from birdslam.lanes.line_filter import PLANE_AT_M
 from birdslam.lanes.line_tracker import LineTracker, still_lines
-from birdslam.lanes.occupancy import FARTHEST_M, with_users
+from birdslam.lanes.occupancy import MAX_DISTANCE_M, with_users
 from birdslam.lanes.outline import lane_mask, lane_px, line_px
 from birdslam.lanes.paint import RESOLVED_M, LinePoints, paint_points
 from birdslam.lanes.road_view import road_view
 from birdslam.lanes.topology import lane_row
 from birdslam.lanes.traffic import STATED_SIDE, Traffic, TrafficState, stated
 from birdslam.lanes.users import UserInEgo, person_in_ego
-from birdslam.outputs.drive_video import MOST_SCALE, MOST_WIDTH_PX, SideBySide
+from birdslam.outputs.drive_video import MAX_SCALE, MAX_WIDTH_PX, SideBySide
 from birdslam.outputs.line_map import LineMap
 from birdslam.perception import Segmentation
 from birdslam.runtime.configuration import Configuration
@@ -488,7 +488,7 @@ def test_who_is_far_away_is_in_no_lane(xs_m: list[float]) -> None:
     lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0)
     users = [UserInEgo(k, SE2(x_m, 0.1, 0.0), np.eye(3) * 0.1, 4.0, 8.0) for k, x_m in enumerate(xs_m)]
     placed = with_users(lanes, users, 10.0, Traffic()).vehicles
-    assert [one.vehicle for one in placed] == [k for k, x_m in enumerate(xs_m) if abs(x_m) < FARTHEST_M]
+    assert [one.vehicle for one in placed] == [k for k, x_m in enumerate(xs_m) if abs(x_m) < MAX_DISTANCE_M]
 
 
 def test_the_leader_is_the_nearest_in_the_egos_lane() -> None:
@@ -782,7 +782,7 @@ def test_lines_are_drawn_behind_who_stands_on_the_road() -> None:
     image = np.full((CAMERA.height_px, CAMERA.width_px, 3), 90, np.uint8)
     with_lines = SideBySide(CAMERA).draw(image, estimate, [], [])
     without = SideBySide(CAMERA).draw(image, msgspec.structs.replace(estimate, lanes=None), [], [])
-    scale = min(MOST_SCALE, MOST_WIDTH_PX / CAMERA.width_px)
+    scale = min(MAX_SCALE, MAX_WIDTH_PX / CAMERA.width_px)
     on_car, before_it = (
         np.rint((bev.ego_to_pixel(CAMERA, CAMERA.ground, np.array([at]))[0] + 0.5) * scale - 0.5).astype(int)
         for at in ((18.0, 1.75), (9.0, 1.75))

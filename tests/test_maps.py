@@ -20,7 +20,7 @@ from birdslam.loops.closing import close_loops, held
 from birdslam.loops.features import Features, match, match_near
 from birdslam.loops.foot import body_pose, foot
 from birdslam.loops.keyframe import Link
-from birdslam.loops.localiser import SELDOM_M, Localisation
+from birdslam.loops.localiser import RARE_M, Localisation
 from birdslam.loops.map_file import HEAD, MAGIC, MapError, decode_map, encode_map
 from birdslam.loops.map_pose import MapPose, MapState, in_map
 from birdslam.loops.merging import MergeError, merged
@@ -121,7 +121,7 @@ def test_places_are_looked_up_seldom_on_a_way_that_the_map_does_not_know(
     assert len(look_ups) == 20
     look_ups.clear()
     driven(PlaceMap(MapCamera.of(CAMERA)), STREET, range(100), extend=True)
-    assert 0 < len(look_ups) <= 100 / SELDOM_M + 2
+    assert 0 < len(look_ups) <= 100 / RARE_M + 2
 
 
 def test_who_is_lost_has_no_pose_and_no_small_covariance(mapped: bytes) -> None:
@@ -658,7 +658,7 @@ def test_the_commands(files: dict[str, Path], tmp_path: Path, capsys: pytest.Cap
 
 
 def test_what_is_kept_of_a_long_drive_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(held_way, "MOST_POSES", 16)
+    monkeypatch.setattr(held_way, "MAX_POSES", 16)
     driving = map_drive.MapDrive(MapChoice(tmp_path / "new.map", extend=True), CAMERA, tmp_path)
     estimates = [estimate for estimate, _, _ in drive(STREET, range(100), 3)]
     for estimate in estimates:

@@ -17,7 +17,7 @@ from birdslam.bench.simulation.drive import DriveConfig, drive
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.runtime.configuration import BudgetsConfig, Configuration, DegradationConfig, RuntimeConfig, SourceConfig
-from birdslam.runtime.nodes.checkpoints import MOST_BYTES, CheckpointFile, newest_checkpoint
+from birdslam.runtime.nodes.checkpoints import MAX_BYTES, CheckpointFile, newest_checkpoint
 from birdslam.runtime.nodes.coasting import Overdue, PendingFrames, deadline_ns, unmeasured
 from birdslam.runtime.nodes.optimize import OptimizeNode
 from birdslam.runtime.process.restarts import FIRST, Assignment, Resume
@@ -310,7 +310,7 @@ def test_whatever_a_kill_cuts_short_the_other_checkpoint_is_whole(tmp_path: Path
     content = path.read_bytes()
     overwrite(path, content.index(b"b") - HEAD_BYTES, bytes(8))  # killed in the middle of it
     assert [kept.data for kept in CheckpointFile(path).take()] == [b"a"]
-    assert not file.store(7, 7, bytes(MOST_BYTES + 1))
+    assert not file.store(7, 7, bytes(MAX_BYTES + 1))
     assert (tmp_path / "c").stat().st_mode & 0o777 == 0o600
 
 

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from birdslam.perception import Detections, Findings, ModelSpec, Networks, Perception, Ready, Segmentation, load_network
-from birdslam.perception.decoding.detection import MOST_CANDIDATES, YoloxDecoder, intersections, suppress
+from birdslam.perception.decoding.detection import MAX_CANDIDATES, YoloxDecoder, intersections, suppress
 from birdslam.perception.manifest import SHIPPED_NETWORKS, FitPad, Input, Schedule, Stretch, Tiles, Yolox
 from birdslam.perception.views import Preparation, View, make_views
 from birdslam.types import Status
@@ -164,7 +164,7 @@ def test_a_network_gone_wild_is_bounded() -> None:
     raw = np.zeros((1, 3549, 9), np.float32)
     raw[..., 2:4], raw[..., 4:6] = -9.0, 1.0  # a tiny car in every cell
     found = reader.merge([reader.read({"output": raw[:, :CELLS]}, view)] * 3, [view] * 3)
-    assert len(found) <= 3 * MOST_CANDIDATES
+    assert len(found) <= 3 * MAX_CANDIDATES
     raw[..., 2:4] = 200.0  # sizes beyond all numbers
     huge = reader.merge([reader.read({"output": raw[:, :CELLS]}, view)], [view])
     assert np.all(np.isfinite(huge.boxes_px))

@@ -150,7 +150,7 @@ of_both_graphs = pytest.mark.parametrize("base", BASES, ids=["paper", "birdslam"
 def noisy_log(sequence: TrackingSequence, tmp_path_factory: pytest.TempPathFactory) -> list[Measurements]:
     """With landmarks beyond every threshold of Table 4."""
     root = tracking_world.write(tmp_path_factory.mktemp("noisy"))
-    return log_of(sequence, root, SimulationConfig(), 1, ablation.FARTHEST_LANDMARK_M)
+    return log_of(sequence, root, SimulationConfig(), 1, ablation.MAX_LANDMARK_DISTANCE_M)
 
 
 def test_a_log_with_far_landmarks_has_the_nearer_one_in_it(

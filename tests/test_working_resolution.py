@@ -12,7 +12,7 @@ from birdslam.odometry.odometry import Odometry
 from birdslam.odometry.working_resolution import (
     FOCAL_PX,
     LARGEST_FOCAL_PX,
-    LEAST_FOCAL_PX,
+    MIN_FOCAL_PX,
     SMALLEST_FOCAL_PX,
     WorkingResolution,
 )
@@ -22,7 +22,7 @@ def camera(focal_px: float, width_px: int = 1920, height_px: int = 1080) -> Came
     return Camera(width_px, height_px, focal_px, focal_px, 0.5 * (width_px - 1), 0.52 * height_px, height_m=1.3)
 
 
-@pytest.mark.parametrize("focal_px", [LARGEST_FOCAL_PX, SMALLEST_FOCAL_PX, LEAST_FOCAL_PX - 1.0])
+@pytest.mark.parametrize("focal_px", [LARGEST_FOCAL_PX, SMALLEST_FOCAL_PX, MIN_FOCAL_PX - 1.0])
 def test_a_film_that_suits_it_stays_as_it_is(focal_px: float) -> None:
     given_camera = camera(focal_px)
     resolution = WorkingResolution(given_camera)
@@ -33,7 +33,7 @@ def test_a_film_that_suits_it_stays_as_it_is(focal_px: float) -> None:
 
 
 @given(
-    st.one_of(st.floats(LARGEST_FOCAL_PX + 1.0, 4000.0), st.floats(LEAST_FOCAL_PX, SMALLEST_FOCAL_PX - 1.0)),
+    st.one_of(st.floats(LARGEST_FOCAL_PX + 1.0, 4000.0), st.floats(MIN_FOCAL_PX, SMALLEST_FOCAL_PX - 1.0)),
     st.floats(100.0, 1800.0),
     st.floats(100.0, 1000.0),
 )

@@ -15,7 +15,7 @@ from birdslam.calibration.height_check import LANES, HeightCheck
 from birdslam.lanes.topology import AT_M, WIDTH_M, WIDTH_SIGMA_M
 from birdslam.types import Bound, Lanes
 
-LEAST_WAY_M = 20.0  # under painted lanes: less may be a turning lane, or a bay
+MIN_WAY_M = 20.0  # under painted lanes: less may be a turning lane, or a bay
 _ALIKE_M = 30.0  # a lane widens and narrows over some such way
 
 
@@ -40,7 +40,7 @@ def checks_by_lanes(seen: Sequence[LaneWidth], camera_height_m: float, sigma_pit
     """One, or none where too little was seen of painted lanes. The widths were seen at `camera_height_m`."""
     widths_m, ways_m = (np.array(part) for part in zip(*seen, strict=True)) if seen else (np.zeros(0), np.zeros(0))
     way_m = float(ways_m.sum())
-    if way_m < LEAST_WAY_M:
+    if way_m < MIN_WAY_M:
         return []
     order = np.argsort(widths_m)
     cumulated = np.cumsum(ways_m[order])

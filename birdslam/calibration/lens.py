@@ -34,7 +34,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 SIGMA_PX = 0.5  # of a corner, by pixels of a lens of FOCAL_PX
-_LEAST_TURN_RAD = math.radians(30.0)  # a drive that turns less shows no focal length: of 19 real ones eleven did not
+_MIN_TURN_RAD = math.radians(30.0)  # a drive that turns less shows no focal length: of 19 real ones eleven did not
 _BEGUN = -1.0, 0.0, 1.0  # where the focal length is looked for from, in sigmas of what is known of it
 _ROUGHLY = 1e-4  # how far each is adjusted
 _BLOCKS = 8  # of the windows, for the sigma
@@ -46,8 +46,8 @@ STATED_SIGMA_REL = 0.03  # of a focal length by a field of view that somebody st
 WIDE_DEG = 110.0
 # ... of whose focal length it is this: equisolid and stereographic lenses are 4 to 6 % and 8 to 15 % off (110, 140 deg)
 WIDE_SIGMA_REL = 0.08
-LEAST_SIGMA_REL = 0.03  # of the focal length: on 19 real drives the fit's own was up to 26 times too small
-LEAST_SIGMA_K1 = 0.01
+MIN_SIGMA_REL = 0.03  # of the focal length: on 19 real drives the fit's own was up to 26 times too small
+MIN_SIGMA_K1 = 0.01
 
 
 @dataclass(frozen=True)
@@ -120,18 +120,18 @@ def self_calibrate(
         prior = FocalPrior(math.log(focal_px), focal_sigma_rel)
         sigmas = sigmas_of(fitted, prior)
     shown = False
-    if turned_rad > _LEAST_TURN_RAD:
+    if turned_rad > _MIN_TURN_RAD:
         found = _with_focal_length(windows, fitted, prior)
         sigmas_found = sigmas_of(found, prior)
-        shown = bool(max(sigmas_found[1], LEAST_SIGMA_REL) < _SHOWN * focal_sigma_rel)
+        shown = bool(max(sigmas_found[1], MIN_SIGMA_REL) < _SHOWN * focal_sigma_rel)
         fitted, sigmas = (found, sigmas_found) if shown else (fitted, sigmas)
     if shown:
-        focal_sigma_rel = max(float(sigmas[1]), LEAST_SIGMA_REL)
+        focal_sigma_rel = max(float(sigmas[1]), MIN_SIGMA_REL)
     return Lens(
         focal_px=math.exp(fitted.log_focal),
         k1=fitted.k1,
         focal_sigma_rel=focal_sigma_rel,
-        k1_sigma=min(max(LEAST_SIGMA_K1, float(sigmas[0])), k1_before[1]),
+        k1_sigma=min(max(MIN_SIGMA_K1, float(sigmas[0])), k1_before[1]),
         windows=len(fitted.R),
         corners=len(fitted.px),
         turned_rad=turned_rad,

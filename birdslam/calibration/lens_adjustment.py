@@ -26,9 +26,9 @@ SHARED = 3  # numbers that all windows share
 _HUBER = 1.5  # sigmas
 _ITERATIONS = 30
 _CONVERGED = 1e-6  # relative change of the cost
-_LEAST_LEFT = 8  # corners of a window, whose poses have 30 numbers
-_LEAST_S = 1e-3  # between two images
-_NEAREST, _BEHIND_COST = 1e-3, 1e3  # a corner is no nearer; what one behind the camera costs
+_MIN_LEFT = 8  # corners of a window, whose poses have 30 numbers
+_MIN_S = 1e-3  # between two images
+_MIN_DISTANCE, _BEHIND_COST = 1e-3, 1e3  # a corner is no nearer; what one behind the camera costs
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def at_focal_length(problem: LensProblem, log_focal: float) -> LensProblem:
 def some_corners(problem: LensProblem, some: NDArray[np.bool_]) -> LensProblem:
     """The problem of some of the corners (P,) alone; windows of which few are left are left out."""
     left = np.bincount(problem.of[some], minlength=len(problem.R))
-    some = some & (left >= _LEAST_LEFT)[problem.of]
+    some = some & (left >= _MIN_LEFT)[problem.of]
     windows = np.unique(problem.of[some])
     return replace(
         problem,
@@ -156,7 +156,7 @@ def _project(problem: LensProblem) -> tuple[Floats, Floats, Floats, Floats]:
     turn, shift = (rate[problem.of] for rate in _rates(problem))
     by_readout = problem.row[..., None] * (np.cross(turn, q) + problem.corner[:, 2, None, None] * shift)
     q = q + problem.readout_s * by_readout
-    u = q[..., :2] / np.maximum(q[..., 2:], _NEAREST)
+    u = q[..., :2] / np.maximum(q[..., 2:], _MIN_DISTANCE)
     return turned, q, u, by_readout
 
 
@@ -167,7 +167,7 @@ def _rates(problem: LensProblem) -> tuple[Floats, Floats]:
     """
     R, t = problem.R, problem.t
     step = R[:, 1:] @ R[:, :-1].transpose(0, 1, 3, 2)
-    dt_s = np.maximum(np.diff(problem.t_s), _LEAST_S)[..., None]
+    dt_s = np.maximum(np.diff(problem.t_s), _MIN_S)[..., None]
     turn = 0.5 * np.stack([step[..., b, a] - step[..., a, b] for a, b in ((1, 2), (2, 0), (0, 1))], axis=-1) / dt_s
     shift = (t[:, 1:] - np.einsum("wkij,wkj->wki", step, t[:, :-1])) / dt_s
     turn, shift = (np.concatenate([x[:, :1], 0.5 * (x[:, 1:] + x[:, :-1]), x[:, -1:]], axis=1) for x in (turn, shift))
@@ -192,7 +192,7 @@ def _huber(problem: LensProblem, q: Floats, d: Floats) -> tuple[Floats, Floats, 
     """Residuals in sigma (P, I, 2), their weights and costs (P, I)."""
     r = (math.exp(problem.log_focal) * d - problem.px) / problem.sigma_px
     norm = np.sqrt(np.square(r).sum(axis=-1))
-    ahead = q[..., 2] > _NEAREST
+    ahead = q[..., 2] > _MIN_DISTANCE
     weight = np.where(ahead, 1.0 / np.maximum(1.0, norm / _HUBER), 0.0)
     cost = np.where(norm < _HUBER, 0.5 * norm**2, _HUBER * norm - 0.5 * _HUBER**2)
     return r, weight, np.where(ahead, cost, _BEHIND_COST)
@@ -212,7 +212,7 @@ def _linearise(problem: LensProblem, prior: FocalPrior | None) -> tuple[float, _
     cost = float(each.sum()) + 0.5 * float(known[1] @ away**2)
 
     u_q = np.concatenate([np.broadcast_to(np.eye(2), (*u.shape, 2)), -u[..., None]], axis=-1)
-    J_q = (focal_px / sigma_px) * (d_u @ u_q) / np.maximum(q[..., 2], _NEAREST)[..., None, None]  # (P, I, 2, 3)
+    J_q = (focal_px / sigma_px) * (d_u @ u_q) / np.maximum(q[..., 2], _MIN_DISTANCE)[..., None, None]  # (P, I, 2, 3)
     J_corner = np.concatenate(
         [
             np.einsum("pick,pikl->picl", J_q, problem.R[problem.of][..., :2]),

@@ -25,15 +25,15 @@ Ints = NDArray[np.int64]
 _MOVED, _MOVED_WIDE = 0.4, 0.15
 _STEPS_RAD = (0.016, _MOVED), (0.012, _MOVED), (0.012, _MOVED_WIDE)
 _FIXED_RAD = 0.003  # a corner that moves by less over a window is far off, or on the windscreen or bonnet
-_MOST_WINDOWS = 40
-_LEAST_WINDOWS = 4
-_LEAST_CORNERS = 20  # of a window
-_MOST_CORNERS = 100
+_MAX_WINDOWS = 40
+_MIN_WINDOWS = 4
+_MIN_CORNERS = 20  # of a window
+_MAX_CORNERS = 100
 _NEAR_CORNERS = 60  # of these, where the nearest are asked for
 _TWO_VIEW_PX = 1.5  # outliers' limit of the first poses, by pixels of a lens of FOCAL_PX
 FOCAL_PX = 720.0
-_MOST_TURN_RAD = 0.8  # of a window
-_FARTHEST = 80.0  # of a corner that begins the adjustment, in baselines of its window
+_MAX_TURN_RAD = 0.8  # of a window
+_MAX_DISTANCE = 80.0  # of a corner that begins the adjustment, in baselines of its window
 _WIDEST_RAD = 1.45  # from the axis, of a corner
 
 
@@ -80,7 +80,7 @@ def windows_of(images: Sequence[CornersOfImage], middle: Floats, focal_px: float
     """Windows of a drive; `middle` (2,) is that of its images, the focal length about right."""
     windows: list[Window] = []
     for step_rad, share in _STEPS_RAD:
-        if len(windows) < 2 * _LEAST_WINDOWS:
+        if len(windows) < 2 * _MIN_WINDOWS:
             windows = _apart(images, middle, step_rad * focal_px, share)
     return windows
 
@@ -100,7 +100,7 @@ def _apart(
         at = [first]
         for k in range(first + 1, len(images)):
             moved = _flow_px(images[at[-1]], images[k])
-            if len(moved) < _LEAST_CORNERS:
+            if len(moved) < _MIN_CORNERS:
                 break
             if np.quantile(moved, 1.0 - share) > step_px:
                 at.append(k)
@@ -113,7 +113,7 @@ def _apart(
         if window is not None:
             found.append(window)
         first = at[IMAGES // 2]
-    keep = np.unique(np.linspace(0, len(found) - 1, min(len(found), _MOST_WINDOWS)).round().astype(int))
+    keep = np.unique(np.linspace(0, len(found) - 1, min(len(found), _MAX_WINDOWS)).round().astype(int))
     return [found[k] for k in keep]
 
 
@@ -133,13 +133,13 @@ def _common(
     first, last = (images[k].px[np.searchsorted(images[k].ids, ids)] for k in (at[0], at[-1]))
     moved = np.linalg.norm(last - first, axis=1)
     ids, moved = ids[moved > fixed_px], moved[moved > fixed_px]
-    if len(ids) < _LEAST_CORNERS:
+    if len(ids) < _MIN_CORNERS:
         return None
-    if len(ids) > _MOST_CORNERS:  # evenly over their ids, which are those of all parts of the image
-        some = np.linspace(0, len(ids) - 1, _MOST_CORNERS).astype(int)
+    if len(ids) > _MAX_CORNERS:  # evenly over their ids, which are those of all parts of the image
+        some = np.linspace(0, len(ids) - 1, _MAX_CORNERS).astype(int)
         if nearest:  # those that moved most, and of the others some that hold the turns
             order = np.argsort(-moved, kind="stable")
-            least = np.linspace(_NEAR_CORNERS, len(ids) - 1, _MOST_CORNERS - _NEAR_CORNERS).astype(int)
+            least = np.linspace(_NEAR_CORNERS, len(ids) - 1, _MAX_CORNERS - _NEAR_CORNERS).astype(int)
             some = np.sort(np.concatenate([order[:_NEAR_CORNERS], order[least]]))
         ids = ids[some]
     px = np.array([images[k].px[np.searchsorted(images[k].ids, ids)] - middle for k in at])
@@ -183,7 +183,7 @@ def begin(
         R.append(R_w)
         t.append(t_w)
         corner.append(corner_w)
-    if len(R) < _LEAST_WINDOWS:
+    if len(R) < _MIN_WINDOWS:
         return None
     return LensProblem(
         np.concatenate(px),
@@ -213,15 +213,15 @@ def _begin_window(xy: Floats) -> tuple[NDArray[np.bool_], Floats, Floats, Floats
     _, R, t, _, _ = cv2.recoverPose(E, first, last, cameraMatrix=np.eye(3), distanceThresh=1e5, mask=inliers.copy())
     turn: Floats = np.asarray(R, np.float64)
     R, t = turn, np.asarray(t, np.float64).ravel()
-    if abs(t[2]) < 0.5 or np.linalg.norm(rotation_log(turn)) > _MOST_TURN_RAD:  # no car's
+    if abs(t[2]) < 0.5 or np.linalg.norm(rotation_log(turn)) > _MAX_TURN_RAD:  # no car's
         return None
     P = np.hstack([R, t[:, None]])
     X = cv2.triangulatePoints(np.eye(3, 4), P, first.T, last.T)
     with np.errstate(divide="ignore", invalid="ignore"):
         X = (X[:3] / X[3]).T
-    ahead = (X[:, 2] > 0.1) & (X[:, 2] < _FARTHEST) & ((X @ R.T + t)[:, 2] > 0.1)
+    ahead = (X[:, 2] > 0.1) & (X[:, 2] < _MAX_DISTANCE) & ((X @ R.T + t)[:, 2] > 0.1)
     keep = np.asarray((inliers.ravel() > 0) & ahead & np.isfinite(X).all(axis=1))
-    if keep.sum() < _LEAST_CORNERS:
+    if keep.sum() < _MIN_CORNERS:
         return None
     poses_R, poses_t = [np.eye(3)], [np.zeros(3)]
     for seen in xy[1:-1]:

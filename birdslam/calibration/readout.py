@@ -16,16 +16,16 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from birdslam.calibration.lens import LEAST_SIGMA_K1, SIGMA_PX, sigmas_of
+from birdslam.calibration.lens import MIN_SIGMA_K1, SIGMA_PX, sigmas_of
 from birdslam.calibration.lens_adjustment import HELD, FocalPrior, adjust
 from birdslam.calibration.lens_windows import FOCAL_PX, CornersOfImage, begin, near_windows
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 
 _USUAL_S = 0.0, 0.03  # of dashboard cameras and phones, each as likely
-_LEAST_FOCAL_REL = 0.005  # 1-sigma of a focal length that was measured
+_MIN_FOCAL_REL = 0.005  # 1-sigma of a focal length that was measured
 _FREE_S = 0.1  # 1-sigma with which the corners begin
-MOST_S = 0.1  # of a camera file
+MAX_S = 0.1  # of a camera file
 
 
 class Readout(NamedTuple):
@@ -59,18 +59,18 @@ def readout_of_drive(
         replace(window, px=focal_px * _undistorted(window.px + middle, camera))
         for window in near_windows(images, middle, focal_px)
     ]
-    k1 = 0.0, max(k1_sigma, LEAST_SIGMA_K1)
+    k1 = 0.0, max(k1_sigma, MIN_SIGMA_K1)
     begun = begin(windows, focal_px, 0.0, SIGMA_PX * focal_px / FOCAL_PX, False, k1, (0.0, _FREE_S))
     if begun is None:
         return USUAL
-    prior = FocalPrior(math.log(focal_px), max(focal_sigma_rel, _LEAST_FOCAL_REL, HELD))
+    prior = FocalPrior(math.log(focal_px), max(focal_sigma_rel, _MIN_FOCAL_REL, HELD))
     fitted = adjust(begun, prior)
     by_drive, sigma_s = fitted.readout_s, float(sigmas_of(fitted, prior)[2])
     if not (math.isfinite(by_drive) and sigma_s < _FREE_S):
         return USUAL
     information = sigma_s**-2.0, USUAL.sigma_s**-2.0
     both_s = (information[0] * by_drive + information[1] * USUAL.readout_s) / sum(information)
-    return Readout(min(max(both_s, 0.0), MOST_S), sum(information) ** -0.5, (by_drive, sigma_s), len(fitted.R))
+    return Readout(min(max(both_s, 0.0), MAX_S), sum(information) ** -0.5, (by_drive, sigma_s), len(fitted.R))
 
 
 def _undistorted(px: Floats, camera: Camera) -> Floats:

@@ -13,7 +13,7 @@ import numpy as np
 
 from birdslam.calibration.lens_adjustment import LensProblem
 
-_LEAST_WINDOWS = 4
+_MIN_WINDOWS = 4
 _TRAVEL_SIGMA_RAD = 0.003  # a car squats on its springs, and climbs a little
 _STEEPEST_RAD = 0.3  # a direction farther from the axis is no car's
 _NORMAL_PER_MAD = 1.4826  # a normal distribution's sigma by its median absolute deviation
@@ -36,7 +36,7 @@ def pitch_by_travel(problem: LensProblem, focal_sigma_rel: float) -> TravelPitch
     steps = np.einsum("wikl,wil->wik", problem.R[:, :-1], np.diff(at, axis=1))
     pitch = np.arctan2(-steps[..., 1], np.linalg.norm(steps[..., ::2], axis=-1)).mean(axis=1)
     pitch = pitch[(steps[..., 2] > 0.0).all(axis=1) & (np.abs(pitch) < _STEEPEST_RAD)]
-    if len(pitch) < _LEAST_WINDOWS:
+    if len(pitch) < _MIN_WINDOWS:
         return None
     centre = float(np.median(pitch))
     spread = _NORMAL_PER_MAD * float(np.median(np.abs(pitch - centre)))

@@ -24,8 +24,8 @@ Floats = NDArray[np.float64]
 
 UPRIGHT_IMAGES = 30  # of a drive, in which upright lines are looked for
 _WIDTH_PX = 800  # of the image in which edges are looked for, at the most
-_LEAST_LENGTH, _MOST_LEAN = 0.03, 0.35  # of an edge: in widths, and its slope against the image's columns
-_LEAST_EDGES, _BLOCKS = 100, 6  # in all; of the drive, for the sigma
+_MIN_LENGTH, _MAX_LEAN = 0.03, 0.35  # of an edge: in widths, and its slope against the image's columns
+_MIN_EDGES, _BLOCKS = 100, 6  # in all; of the drive, for the sigma
 _LEAN = 0.02  # 1-sigma of an edge's slope, beyond which it weighs less
 _LEAN_ERROR = 0.004  # of the slopes' mean trend over the image: walls and trees that lean; by judgement
 _TILT_SIGMA = 0.05  # of the camera's pitch and roll beforehand
@@ -63,7 +63,7 @@ def upright_edges(image: NDArray[np.uint8]) -> Floats:
     ends = (ends - 0.5 * (np.array([width_px, height_px]) - 1.0)) / width_px
     ends = np.take_along_axis(ends, np.argsort(ends[..., 1], axis=1)[..., None], axis=1)
     across, down = (ends[:, 1] - ends[:, 0]).T
-    upright = (np.hypot(across, down) > _LEAST_LENGTH) & (np.abs(across) < _MOST_LEAN * down)
+    upright = (np.hypot(across, down) > _MIN_LENGTH) & (np.abs(across) < _MAX_LEAN * down)
     out: Floats = ends[upright & (ends[..., 1].sum(axis=1) < 0.0)]
     return out
 
@@ -71,7 +71,7 @@ def upright_edges(image: NDArray[np.uint8]) -> Floats:
 def lens_by_uprights(images: Sequence[Floats]) -> LensByUprights | None:
     """The lens by the edges (N, 2, 2) of each of a drive's images, in their order; None where there are too few."""
     edges = np.concatenate([np.zeros((0, 2, 2)), *images])
-    if len(edges) < _LEAST_EDGES:
+    if len(edges) < _MIN_EDGES:
         return None
     block = np.repeat(np.arange(len(images)) * _BLOCKS // len(images), [len(image) for image in images])
     by_bend = np.array([_costs(edges, block, _pinhole(bend)) for bend in _BENDS])

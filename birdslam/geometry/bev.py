@@ -16,7 +16,7 @@ from birdslam.geometry.camera import PLANE_AT_M, Camera, GroundPlane
 Numbers = TypeVar("Numbers", float, Floats)
 
 MAX_RANGE_M = 200.0  # beyond it a pixel row covers tens of metres
-_LEAST_SLOPE = 1e-4  # of a ray that meets the road
+_MIN_SLOPE = 1e-4  # of a ray that meets the road
 
 
 def meet_road(rays: Floats, fall: Floats, height_m: float) -> Floats:
@@ -42,7 +42,7 @@ def meet_bend(slope: Floats, height_m: float, vertical_per_m: float) -> Floats:
     """
     if vertical_per_m:
         slope = 0.5 * (slope + np.sqrt(np.maximum(slope * slope + 2.0 * vertical_per_m * height_m, 0.0)))
-    return meet_road(np.ones_like(slope), np.maximum(slope, _LEAST_SLOPE), height_m)
+    return meet_road(np.ones_like(slope), np.maximum(slope, _MIN_SLOPE), height_m)
 
 
 def tilted(

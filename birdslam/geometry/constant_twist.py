@@ -10,7 +10,7 @@ import numpy as np
 
 from birdslam.geometry.arrays import Complexes, Floats
 
-_LEAST_RAD = 1e-20  # in the place of no turn, for which sin w / w is 1
+_MIN_RAD = 1e-20  # in the place of no turn, for which sin w / w is 1
 
 
 def advance(
@@ -37,6 +37,6 @@ def rate(way: Complexes, yaw_rad: Floats, dt_s: Floats) -> tuple[Complexes, Floa
 
 def _chord(w: Floats) -> Floats:
     """|e^iw - 1| / w: how much shorter the way is than along its arc."""
-    half = np.abs(0.5 * w) + _LEAST_RAD
+    half = np.abs(0.5 * w) + _MIN_RAD
     out: Floats = np.sin(half) / half
     return out

@@ -14,7 +14,7 @@ from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 
 _CELL_PX = 8  # of the table of rows: a lens bends a row by far less within it
-_NEAREST = 0.05  # of a depth that a motion while an image is read would leave, as a share of it
+_MIN_DISTANCE = 0.05  # of a depth that a motion while an image is read would leave, as a share of it
 _ROUNDS = 2  # by which the row is found that a point is read in
 Rate = tuple[Floats, Floats]  # (3,) a second and (3,) rad/s of the camera, in its own axes
 
@@ -60,7 +60,7 @@ def _moved(xy: Floats, inverse_depth: Floats, rate: Rate, for_s: Floats) -> Floa
     rays = np.column_stack([xy, np.ones(len(xy))])
     shift, turn = rate
     q = rays + for_s[:, None] * (inverse_depth[:, None] * shift + np.cross(turn, rays))
-    out: Floats = q[:, :2] / np.maximum(q[:, 2:], _NEAREST)
+    out: Floats = q[:, :2] / np.maximum(q[:, 2:], _MIN_DISTANCE)
     return out
 
 

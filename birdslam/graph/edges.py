@@ -12,7 +12,7 @@ from birdslam.geometry.se2 import SE2
 from birdslam.types import EgoEdge, Measurements, MotionEdge, VehicleEdge
 
 LARGEST_M = 1e5  # an edge that is longer, or less certain, is no measurement
-_LEAST_COV = 1e-12
+_MIN_COV = 1e-12
 
 
 @dataclass(slots=True)
@@ -82,4 +82,4 @@ def _is_valid(T: SE2, cov: tuple[float, ...]) -> bool:
     if max(map(abs, cov)) > LARGEST_M:
         return False
     P = np.reshape(cov, (3, 3))
-    return bool(np.linalg.eigvalsh(0.5 * (P + P.T))[0] >= -_LEAST_COV)
+    return bool(np.linalg.eigvalsh(0.5 * (P + P.T))[0] >= -_MIN_COV)

@@ -17,7 +17,7 @@ from birdslam.graph.factors.landmark_points import LandmarkKey, sightings
 from birdslam.graph.weights import WeightsConfig, weighted
 from birdslam.types import Measurements
 
-_LEAST_VARIANCE = 1e-12  # an edge may be exact in some direction
+_MIN_VARIANCE = 1e-12  # an edge may be exact in some direction
 
 Node = tuple[str, int, int] | LandmarkKey  # "ego" or "vehicle", which, frame; or a landmark
 
@@ -76,6 +76,6 @@ def _pose(T: SE2) -> str:
 
 
 def _edge(start: int, end: int, T: SE2, cov: tuple[float, ...]) -> str:
-    information = np.linalg.inv(np.reshape(cov, (3, 3)) + _LEAST_VARIANCE * np.eye(3))
+    information = np.linalg.inv(np.reshape(cov, (3, 3)) + _MIN_VARIANCE * np.eye(3))
     upper = " ".join(repr(n) for n in information[np.triu_indices(3)].tolist())
     return f"EDGE_SE2 {start} {end} {_pose(T)} {upper}"

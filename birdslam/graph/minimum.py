@@ -14,7 +14,7 @@ from birdslam.graph.factors.factor import Linearised
 from birdslam.graph.state_layout import EGO, LASTING, OF_VEHICLE, StateLayout, diagonal_blocks
 from birdslam.graph.window import Window
 
-_LEAST = 1e-8  # 0.1 mm, 0.1 mrad: edges more exact than that would cost the covariances their digits
+_MIN_VARIANCE = 1e-8  # 0.1 mm, 0.1 mrad: edges more exact than that would cost the covariances their digits
 _LEFT_OUT = 1e12  # so uncertain an edge says nothing
 
 
@@ -69,7 +69,7 @@ def _each_vehicle(window: Window, term: Linearised, moved: Floats) -> None:
         residual = residual - J @ moved[rows][:, :, None]
         S = HV @ J.transpose(0, 2, 1)
     S += term.covs
-    S.reshape(k, d * d)[:, :: d + 1] += _LEAST
+    S.reshape(k, d * d)[:, :: d + 1] += _MIN_VARIANCE
     weights = _inverses(S)
     if term.gate is not None and _inflate(S, term, term.gate, pose_costs(residual, weights)):
         weights = _inverses(S)
@@ -185,7 +185,7 @@ def _add_noise(S: Floats, terms: Sequence[Linearised]) -> None:
         blocks += term.covs
         placed.append((term, blocks))
         first += len(blocks) * blocks.shape[1]
-    S.reshape(-1)[:: len(S) + 1] += _LEAST
+    S.reshape(-1)[:: len(S) + 1] += _MIN_VARIANCE
     for term, blocks in placed:
         if term.gate is not None:
             residual = np.reshape(term.residual, (*blocks.shape[:2], 1))

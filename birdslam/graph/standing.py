@@ -21,12 +21,12 @@ PRIOR = 1.0 / 3.0  # of the vehicles stand when first seen, as parallax.py has i
 # Of those first seen more than 15 m aside, on another road or on none. By the labels of KITTI tracking 0000 to 0020: 48
 # of 62 cars that do either, at their first sight of 25 px; nearer, but for the ego's own lane, it is 103 of 212
 PRIOR_BESIDE = 0.75
-SUREST = 0.99  # and 1 less it: neither of the two is believed to be surer
+MAX_PROBABILITY = 0.99  # and 1 less it: neither of the two is believed to be surer
 # To decide, and below it to give a decision up. By judgement; from 0.5 to 0.7 and from 0.9 to 0.95 the cars of KITTI
 # tracking 0000-0018 by RRC's boxes, and of 0005 by two networks', are decided alike but for some 10 sights of 5,600
 DECIDED, GIVEN_UP = 0.9, 0.7
 STANDING_MPS = 0.05  # 1-sigma of the velocity of what stands, as of the final trajectories
-_LEAST_DET = 1e-12  # of a velocity's covariance, (m/s)^4
+_MIN_DET = 1e-12  # of a velocity's covariance, (m/s)^4
 _SHARE = {Moves.STANDING: 1.0, Moves.DRIVING: 0.0}
 
 
@@ -41,7 +41,7 @@ def judge(vehicles: Sequence[VehicleNode], velocities: Floats, covs: Floats, bir
         return
     x, y = velocities[rows].T
     xx, xy, yy = covs[rows, 0, 0], covs[rows, 0, 1], covs[rows, 1, 1]
-    det = np.maximum(xx * yy - xy * xy, _LEAST_DET)
+    det = np.maximum(xx * yy - xy * xy, _MIN_DET)
     z2 = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / det
     by_velocity = _clipped(_logit(PRIOR) + 0.5 * (np.log(birth_det / det) - z2))
     seen = np.array([vehicles[row].standing_seen for row in rows], np.float64)
@@ -87,7 +87,7 @@ def reported_velocities(vehicles: Sequence[VehicleNode], velocities: Floats, cov
 
 
 def _clipped(log_odds: Floats) -> Floats:
-    most = _logit(SUREST)
+    most = _logit(MAX_PROBABILITY)
     return np.minimum(np.maximum(log_odds, -most), most)
 
 

@@ -15,7 +15,7 @@ from birdslam.types import Moves, VehicleEdge
 
 PATH_HALF_WIDTH_M = 1.75  # half a lane, as in vehicles/state/parallax.py
 BESIDE_M = 15.0  # farther aside is another road, or none: see standing.py
-MOST_LOG_HEIGHT = 2.0  # of what is no vehicle
+MAX_LOG_HEIGHT = 2.0  # of what is no vehicle
 SHORTEST_S = 1e-3  # source clocks that stand still or run backwards
 
 
@@ -146,7 +146,7 @@ class VehicleNodes:
             v.standing_seen = edge.standing or None  # 0: nobody said
             v.size_bias_rel = abs(edge.depth_per_height) * edge.sigma_log_height
             if edge.sigma_log_height > 0.0:
-                v.height_m = math.exp(min(edge.log_height, MOST_LOG_HEIGHT))
+                v.height_m = math.exp(min(edge.log_height, MAX_LOG_HEIGHT))
                 v.sigma_height_m = v.height_m * min(edge.sigma_log_height, 1.0)
             v.in_path = abs(edge.T_ego_vehicle.y_m) < PATH_HALF_WIDTH_M
         before = len(self.nodes)

@@ -15,7 +15,7 @@ from birdslam.types import Bound, Lane, LaneChange, LaneLine, Lanes, LineKind
 CROSSED_M = 0.3  # past the line the ego has changed lanes
 WIDTH_GAIN = 0.05  # of a frame's width, in the running mean
 LEVEL = Tilt()
-LEAST_SIGMA_M = 0.15  # lanes of one road differ by so much
+MIN_SIGMA_M = 0.15  # lanes of one road differ by so much
 
 
 class EgoLane:
@@ -49,7 +49,7 @@ class EgoLane:
         if own is None or own.left_bound is not Bound.PAINT or own.right_bound is not Bound.PAINT:
             return
         self._width_m += WIDTH_GAIN * (own.width_m - self._width_m)
-        self._sigma_m = max(LEAST_SIGMA_M, (1.0 - WIDTH_GAIN) * self._sigma_m)
+        self._sigma_m = max(MIN_SIGMA_M, (1.0 - WIDTH_GAIN) * self._sigma_m)
 
     def _changed(self, lines: tuple[LaneLine, ...]) -> LaneChange:
         change = LaneChange.NONE

@@ -35,9 +35,9 @@ RATE_MEMORY_M = 30.0  # a clothoid's rate of curvature dies away over so much tr
 STEP_SIGMAS = np.array([0.005, 0.001, 0.0, 0.0])
 BIN_M = 1.0  # of a line: its points are one observation
 SIGMA_BIN_M = 0.04  # of paint about a smooth curve
-MOST_IN_BIN = 3  # points that count as independent
+MAX_IN_BIN = 3  # points that count as independent
 INDEPENDENT_M = 6.0  # images of the same paint err alike: so much travel makes them independent
-GATE_SIGMAS, LEAST_GATE_M, WIDEST_GATE_M = 3.0, 0.25, 0.7
+GATE_SIGMAS, MIN_GATE_M, WIDEST_GATE_M = 3.0, 0.25, 0.7
 KERNEL_SIGMAS = 2.0  # Cauchy
 ITERATIONS = 4
 # What all lines of a road have in common, 1-sigma and the travel over which it lasts: its vertical curvature (the
@@ -46,9 +46,9 @@ ITERATIONS = 4
 VERTICAL, DIRECTION, COMMON = 0, 1, 2
 SIGMA_COMMON = np.array([7e-4, 0.01])
 MEMORY_M = np.array([50.0, 40.0])
-LEAST_FALL = 0.3  # of a level road's: beyond it lies what a crest hides
-FARTHEST_M, STEEPEST = 40.0, 2.0  # of a line's offset and slope: what is beyond has got lost
-MOST_OF_PRIOR = 0.9  # of the vertical curvature's variance: what has more left was not measured
+MIN_FALL = 0.3  # of a level road's: beyond it lies what a crest hides
+MAX_DISTANCE_M, STEEPEST = 40.0, 2.0  # of a line's offset and slope: what is beyond has got lost
+MAX_OF_PRIOR = 0.9  # of the vertical curvature's variance: what has more left was not measured
 _CELLS = 1 << 16  # bins of one line, for keys
 _JITTER = 1e-9  # of a correlation
 
@@ -98,7 +98,7 @@ class LineFilter:
     def vertical(self) -> VerticalCurvature | None:
         """The road's vertical curvature by the images alone, without its prior; None where they say next to nothing."""
         variance, before = self.cov[VERTICAL, VERTICAL], SIGMA_COMMON[VERTICAL] ** 2
-        if not len(self) or variance > MOST_OF_PRIOR * before:
+        if not len(self) or variance > MAX_OF_PRIOR * before:
             return None
         by_images = 1.0 / (1.0 / variance - 1.0 / before)
         return VerticalCurvature(float(self.common[VERTICAL] * by_images / variance), float(np.sqrt(by_images)))
@@ -165,7 +165,7 @@ class LineFilter:
         variances = self.cov.diagonal()
         if not (np.isfinite(self.cov).all() and np.all(variances > 0.0)):
             return np.zeros(len(self.curves), bool)
-        near = (np.abs(self.curves[:, 0]) < FARTHEST_M) & (np.abs(self.curves[:, 1]) < STEEPEST)
+        near = (np.abs(self.curves[:, 0]) < MAX_DISTANCE_M) & (np.abs(self.curves[:, 1]) < STEEPEST)
         out: Bools = np.isfinite(self.curves).all(axis=1) & near
         return out
 
@@ -234,7 +234,7 @@ class LineFilter:
         gap = np.abs(y[:, None] - at @ curves.T)
         blocks = np.stack([self.block(k) for k in range(len(curves))])
         spread = np.sqrt(np.maximum(((at @ blocks) * at).sum(axis=2), 0.0)).T
-        gate = np.clip(GATE_SIGMAS * np.hypot(spread, sigma), LEAST_GATE_M, WIDEST_GATE_M)
+        gate = np.clip(GATE_SIGMAS * np.hypot(spread, sigma), MIN_GATE_M, WIDEST_GATE_M)
         gap = np.where((gap < gate) & (of[:, None] == classes[None]), gap, np.inf)
         nearest = np.argmin(gap, axis=1)
         off = gap[np.arange(len(x)), nearest]
@@ -250,7 +250,7 @@ class LineFilter:
 def _fall(x_m: Floats, height_m: float, vertical_per_m: float) -> Floats:
     """(N,) how steeply a ray from the camera meets the road at x (N,): at a crest's far end it touches."""
     level = height_m / x_m
-    out: Floats = np.maximum(level + 0.5 * vertical_per_m * x_m, LEAST_FALL * level)
+    out: Floats = np.maximum(level + 0.5 * vertical_per_m * x_m, MIN_FALL * level)
     return out
 
 
@@ -280,7 +280,7 @@ def _bins(
     residual = y - (basis(x) * curves[line]).sum(axis=1)
     by_tilt = np.where(witness[line], by_ray[on, line], 0.0)
     x_bin, r, tilt = (np.bincount(index, weight * value, len(key)) / total for value in (x, residual, by_tilt))
-    variance = np.bincount(index, sigma**2, len(key)) / counts / np.minimum(counts, MOST_IN_BIN) + SIGMA_BIN_M**2
+    variance = np.bincount(index, sigma**2, len(key)) / counts / np.minimum(counts, MAX_IN_BIN) + SIGMA_BIN_M**2
     H = np.zeros((len(key), COMMON + 4 * len(curves) + 1))
     column = COMMON + 4 * (key // _CELLS)
     H[np.arange(len(key))[:, None], column[:, None] + np.arange(4)] = basis(x_bin)

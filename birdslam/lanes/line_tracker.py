@@ -27,13 +27,13 @@ from birdslam.types import LaneLine
 
 MOVED_M = 0.8  # travelled between two updates: an image from the same place has the same errors
 STANDING_UPDATES = 4  # of a car that has not moved yet
-LEAST_PAINT_M, LEAST_EDGE_M = 2.4, 8.0  # evidence of a new line
+MIN_PAINT_M, MIN_EDGE_M = 2.4, 8.0  # evidence of a new line
 CERTAIN_M = 5.0  # ... that needs no second image
 APART_M = 0.45  # from a known line
 EDGE_WEIGHT = 0.3  # of an edge's points in the search: side roads and kerbstones bend a mask's border
-MOST_LINES = 9
+MAX_LINES = 9
 IN_VIEW_M = 8.0  # of a line that nothing hides: paint that is there would be seen
-CONFIRMED, MOST_SCORE = 3.0, 8.0
+CONFIRMED, MAX_SCORE = 3.0, 8.0
 SEEN_M = 2.0  # of paint: an image has the line
 SAME_M = 0.3  # two lines nearer than this along all of 5 to 20 m are one
 FORGOTTEN_M = -2.0  # a line that ended so far behind the ego is dropped
@@ -41,8 +41,8 @@ NEAR_M, FAR_M = 5.0, 25.0  # where a line that is there has to be seen
 # Two lines nearer than this anywhere there bound no lane: one whose paint an image lacks gives way to one whose paint
 # it has, so many times as fast as where it is alone
 NARROW_M, GIVES_WAY = 1.5, 3.0
-PAST_EDGE_M, MOST_ROAD_PAST = 0.8, 0.35  # so far past an edge there is no road along so much of it
-LEAST_EXISTENCE, LOOKS_OF_A_SCRAP = 0.4, 4.0  # what has less after so many images is dropped
+PAST_EDGE_M, MAX_ROAD_PAST = 0.8, 0.35  # so far past an edge there is no road along so much of it
+MIN_EXISTENCE, LOOKS_OF_A_SCRAP = 0.4, 4.0  # what has less after so many images is dropped
 AFRESH_M = 10.0  # travelled, as it were, before an image without a past
 # Lines are lost where less than this share of so much paint lies on them, and a search explains so much more of it
 LOST_M, LOST_SHARE, BETTER = 5.0, 0.5, 1.5
@@ -162,9 +162,9 @@ class LineTracker:
             return None, found
         curve = np.array([0.0, shape.heading, shape.curvature_per_m, 0.0])
         for kind, points, least_m, most in (
-            (PAINT, paint, LEAST_PAINT_M, MOST_LINES - 2),
-            (LEFT_EDGE, left, LEAST_EDGE_M, 1),
-            (RIGHT_EDGE, right, LEAST_EDGE_M, 1),
+            (PAINT, paint, MIN_PAINT_M, MAX_LINES - 2),
+            (LEFT_EDGE, left, MIN_EDGE_M, 1),
+            (RIGHT_EDGE, right, MIN_EDGE_M, 1),
         ):
             turned = points.tilted(self._height_m, shape.tilt_rad)
             found += [(kind, peak) for peak in find_lines(turned, curve, least_m, APART_M, most)]
@@ -240,7 +240,7 @@ class LineTracker:
                 side = 1 if track.kind == LEFT_EDGE else -1
                 past = np.clip(column + side * round(PAST_EDGE_M / (view.y_m[1] - view.y_m[0])), 0, len(view.y_m) - 1)
                 looked = clear & (x > NEAR_M) & (x < FAR_M) & ~view.outside[rows, past] & ~view.hidden[rows, past]
-                if view.row_m[looked & view.road[rows, past]].sum() > MOST_ROAD_PAST * max(
+                if view.row_m[looked & view.road[rows, past]].sum() > MAX_ROAD_PAST * max(
                     view.row_m[looked].sum(), 1.0
                 ):
                     track.score -= 1.0
@@ -248,7 +248,7 @@ class LineTracker:
             support_m = _length_m(mine)
             track.evidence_m += support_m
             if support_m >= SEEN_M:
-                track.score = min(track.score + (1.0 if mine.masked.mean() > 0.3 else 0.5), MOST_SCORE)
+                track.score = min(track.score + (1.0 if mine.masked.mean() > 0.3 else 0.5), MAX_SCORE)
                 track.seen_from_m = (
                     min(track.seen_from_m, float(mine.x_m.min())) if track.looks else float(mine.x_m.min())
                 )
@@ -307,7 +307,7 @@ class LineTracker:
         curve = self._filter.curves[like]
         at = basis(np.array([10.0]))[0]
         turned = points.tilted(height_m, self.tilt.tangent_rad, self.tilt.vertical_per_m)
-        for kind, least_m in ((PAINT, LEAST_PAINT_M), (LEFT_EDGE, LEAST_EDGE_M), (RIGHT_EDGE, LEAST_EDGE_M)):
+        for kind, least_m in ((PAINT, MIN_PAINT_M), (LEFT_EDGE, MIN_EDGE_M), (RIGHT_EDGE, MIN_EDGE_M)):
             if kind != PAINT and any(track.kind == kind for track in self._tracks):
                 continue
             mine = turned.of(free & (of == kind))
@@ -315,7 +315,7 @@ class LineTracker:
                 there = at @ np.array([peak.offset_m, peak.heading, curve[2], curve[3]])
                 known = self._filter.curves @ at
                 taken = [abs(there - y) < APART_M for y, t in zip(known, self._tracks, strict=True) if t.kind == kind]
-                if any(taken) or len(self._tracks) >= MOST_LINES:
+                if any(taken) or len(self._tracks) >= MAX_LINES:
                     continue
                 self._filter.add(peak.offset_m, peak.heading, like, kind != PAINT)
                 self._tracks.append(Track(kind, score=1.0))
@@ -327,7 +327,7 @@ class LineTracker:
         ys = self._filter.curves @ basis(x).T
         for k in sorted(range(len(self._tracks)), key=lambda k: -self._tracks[k].score):
             track = self._tracks[k]
-            if track.looks >= LOOKS_OF_A_SCRAP and existence_of(track) < LEAST_EXISTENCE:
+            if track.looks >= LOOKS_OF_A_SCRAP and existence_of(track) < MIN_EXISTENCE:
                 continue
             if track.score <= 0.0 or (track.looks and track.seen_to_m < FORGOTTEN_M):
                 continue
@@ -376,7 +376,7 @@ def still_lines(
     camera: Camera, image: NDArray[np.uint8], segmentation: Segmentation, boxes_px: Floats
 ) -> tuple[tuple[LaneLine, ...], GroundPlane]:
     """The lines of a single image, and the ground under its camera with the pitch that makes them parallel."""
-    tracker = LineTracker(camera, certain_m=LEAST_PAINT_M)  # there will be no other
+    tracker = LineTracker(camera, certain_m=MIN_PAINT_M)  # there will be no other
     tracker.update(SE2(), camera.ground, (camera.tilt_sigma_rad,) * 2, image, segmentation, boxes_px, search_tilt=True)
     ground = GroundPlane(camera.height_m, camera.pitch_rad + tracker.tilt.pitch_rad, camera.roll_rad)
     return tracker.lines().at(SE2()), ground

@@ -13,14 +13,14 @@ from birdslam.lanes.traffic import Traffic, Way, lines_between
 from birdslam.lanes.users import SLOW_MPS, UserInEgo
 from birdslam.types import Lane, Lanes, Leader, VehicleLane
 
-LEAST_LEADER = 0.5  # probability of the ego's lane
-FARTHEST_M = 120.0
+MIN_LEADER = 0.5  # probability of the ego's lane
+MAX_DISTANCE_M = 120.0
 BEND_SIGMA_PER_M = 0.002  # 1-sigma of a lane's curvature beyond where it was seen
 
 
 def with_users(lanes: Lanes, users: Sequence[UserInEgo], ego_mps: float, traffic: Traffic) -> Lanes:
     """The lanes with who is in them and which way they run; `ego_mps` is the ego's own speed."""
-    near = [user for user in users if abs(user.T_ego_vehicle.x_m) < FARTHEST_M]
+    near = [user for user in users if abs(user.T_ego_vehicle.x_m) < MAX_DISTANCE_M]
     if not lanes.lanes or not near:
         return traffic.with_directions(lanes)
     between = lines_between(lanes, near)
@@ -33,7 +33,7 @@ def with_users(lanes: Lanes, users: Sequence[UserInEgo], ego_mps: float, traffic
     ahead = [
         (user, where)
         for user, where in placed
-        if not user.walks and user.T_ego_vehicle.x_m > 0.5 * user.length_m and where.ego_lane > LEAST_LEADER
+        if not user.walks and user.T_ego_vehicle.x_m > 0.5 * user.length_m and where.ego_lane > MIN_LEADER
     ]
     leader = min(ahead, key=lambda item: item[0].T_ego_vehicle.x_m, default=None)
     return msgspec.structs.replace(
@@ -72,7 +72,7 @@ def _shares(lanes: Sequence[Lane], users: Sequence[UserInEgo]) -> list[list[floa
     shapes = [(n.offset_m, n.slope, n.curvature_per_m, n.curvature_rate_per_m2) for n in lanes]
     curves, covs = np.array(shapes), np.array([lane.cov for lane in lanes]).reshape(-1, 4, 4)
     to_m, width_m, growth = np.array([(lane.to_m, lane.width_m, lane.width_slope) for lane in lanes]).T
-    at_m = np.clip(x_m, 0.0, FARTHEST_M)
+    at_m = np.clip(x_m, 0.0, MAX_DISTANCE_M)
     known_m, beyond_m = np.minimum(at_m, to_m), np.maximum(at_m - to_m, 0.0)  # (users, lanes)
     at, bend = basis(known_m), 0.5 * BEND_SIGMA_PER_M * beyond_m * beyond_m
     slope = (slope_basis(known_m) * curves).sum(axis=2)

@@ -24,7 +24,7 @@ CRACK_M = 0.2  # darker stripes up to it are filled before paint is told from as
 SYMBOL_LENGTH_M = 9.0  # longer paint is a line, whatever it touches
 SYMBOL_SHARE = 0.5  # of the contrast of an image's brightest paint: kerbstones are paler
 BAND_M = 1.2  # the widest paint that stands out from its row
-LEAST_CONTRAST = 6.0  # grey levels of a ridge over both sides
+MIN_CONTRAST = 6.0  # grey levels of a ridge over both sides
 NOISE_FACTOR = 5.0  # ... and in multiples of what bare road answers
 # A ridge that no network has counts as far as a line of 0.14 m is two pixels wide: farther off it may be a kerbstone, a
 # rail or a joint as well, and blurs with the paint beside it
@@ -34,7 +34,7 @@ WIDEST_M = 0.9  # of a mask's paint: a wider one is no line
 SIGMA_RIDGE_M = 0.03  # of a ridge's middle, beside a share of a pixel
 SIGMA_MASK_M = 0.08  # of a mask's middle
 PIXEL_SHARE = 0.7  # sigma of a ridge in pixels
-MOST_ROW_M = 0.4  # of road that a far row counts for
+MAX_ROW_M = 0.4  # of road that a far row counts for
 UNSEEN_WEIGHT = 0.5  # of a ridge that no mask knows, as evidence
 SCRAP_SHARE = 0.1  # of the largest piece of the road's mask: a smaller one is a scrap
 ROAD_REACH_M = 0.4  # a line at the road's edge lies partly outside its mask
@@ -42,7 +42,7 @@ GAP_M = 0.25  # of the road's mask: what is less is a mark's border, or noise; a
 # Two stripes are a double line: so far apart from middle to middle at the most, alike, with asphalt between
 DOUBLE_M, STRIPE_SHARE, GAP_SHARE = 0.4, 0.5, 0.6
 DOUBLE_PIXEL_M = 0.025  # the coarsest that shows their gap
-LEAST_DOUBLE, MOST_DOUBLE = 6, 16  # rows of an image that are looked at
+MIN_DOUBLE, MAX_DOUBLE = 6, 16  # rows of an image that are looked at
 SIGMA_EDGE_M = 0.25
 EDGE_PIXELS = 3.0  # sigma of a mask's border in pixels: networks see a half or a quarter of the resolution
 
@@ -100,7 +100,7 @@ def paint_points(view: RoadView) -> LinePoints:
         view.x_m[rows],
         y_m,
         np.hypot(base, share * view.sigma_y_m[rows]),
-        np.minimum(view.row_m[rows], MOST_ROW_M) * np.where(masked, 1.0, UNSEEN_WEIGHT),
+        np.minimum(view.row_m[rows], MAX_ROW_M) * np.where(masked, 1.0, UNSEEN_WEIGHT),
         masked,
         yellow,
         share * view.pixel_rad,
@@ -123,11 +123,11 @@ def _bar(view: RoadView, response: Floats32) -> tuple[float, Bools]:
     usable = on_road & ~view.hidden & ~view.outside
     bare = response[::2, ::3][usable[::2, ::3]]  # a sixth shows the spread as well
     if not len(bare):
-        return LEAST_CONTRAST, usable
+        return MIN_CONTRAST, usable
     # A bare road's response is negative, its spread that of the texture
     middle = float(np.median(bare))
     spread = 1.4826 * float(np.median(np.abs(bare - middle)))
-    return max(LEAST_CONTRAST, NOISE_FACTOR * spread + min(middle, 0.0)), usable
+    return max(MIN_CONTRAST, NOISE_FACTOR * spread + min(middle, 0.0)), usable
 
 
 def _without_scraps(view: RoadView) -> Bools:
@@ -213,9 +213,9 @@ def double_share(view: RoadView, points: LinePoints) -> float | None:
     """
     rows = np.clip(np.searchsorted(view.x_m, points.x_m), 0, len(view.x_m) - 1)
     rows, y_m = rows[fine := view.sigma_y_m[rows] < DOUBLE_PIXEL_M], points.y_m[fine]
-    if len(rows) < LEAST_DOUBLE:
+    if len(rows) < MIN_DOUBLE:
         return None
-    every = 1 + len(rows) // MOST_DOUBLE
+    every = 1 + len(rows) // MAX_DOUBLE
     rows, y_m = rows[::every], y_m[::every]
     reach = round(2.0 * SIDE_M / LATTICE_M)
     middle = np.round((y_m - view.y_m[0]) / LATTICE_M).astype(np.int64)
@@ -225,7 +225,7 @@ def double_share(view: RoadView, points: LinePoints) -> float | None:
     double, between = np.zeros(len(rows), bool), above[:, 1:-1]
     for apart in range(2, round(DOUBLE_M / LATTICE_M) + 1):
         weaker = np.minimum(above[:, :-apart], above[:, apart:])
-        stripes = (weaker > LEAST_CONTRAST) & (weaker > STRIPE_SHARE * above.max(axis=1, keepdims=True))
+        stripes = (weaker > MIN_CONTRAST) & (weaker > STRIPE_SHARE * above.max(axis=1, keepdims=True))
         double |= (stripes & (between < GAP_SHARE * weaker)).any(axis=1)
         between = np.minimum(between[:, :-1], above[:, apart:-1])
     beyond = round((DOUBLE_M + SIDE_M) / LATTICE_M)
@@ -278,7 +278,7 @@ def edge_points(view: RoadView, middle_m: Floats) -> tuple[LinePoints, LinePoint
                 view.x_m[kept],
                 y_m,
                 sigma,
-                np.minimum(view.row_m[kept], MOST_ROW_M),
+                np.minimum(view.row_m[kept], MAX_ROW_M),
                 np.ones(len(kept), bool),
                 nothing,
                 np.full(len(kept), EDGE_PIXELS * view.pixel_rad),

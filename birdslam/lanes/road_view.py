@@ -20,8 +20,8 @@ from birdslam.perception import Segmentation
 
 Grid = Floats32
 
-NEAREST_M = 3.0  # of a row; most cameras see the road from 5 m on
-FARTHEST_M = 50.0
+MIN_DISTANCE_M = 3.0  # of a row; most cameras see the road from 5 m on
+MAX_DISTANCE_M = 50.0
 NEAR_BONNET_M = 15.0  # no bonnet covers more of the road
 ROW_M = 0.25  # between near rows
 HALF_WIDTH_M = 10.0  # of a row
@@ -57,12 +57,12 @@ def _columns_m() -> Floats:
 
 def _rows_m(fy_px: float, height_m: float) -> Floats:
     """Distances of the rows: `ROW_M` apart, or a pixel where that is more (a pixel is x^2 / f H on the road)."""
-    near = np.arange(NEAREST_M, FARTHEST_M, ROW_M)
+    near = np.arange(MIN_DISTANCE_M, MAX_DISTANCE_M, ROW_M)
     turn_m = np.sqrt(ROW_M * fy_px * height_m)  # from here on a pixel is more
     near = near[near < turn_m]
     first = fy_px * height_m / turn_m  # pixels below the horizon
-    far = fy_px * height_m / np.arange(first, fy_px * height_m / FARTHEST_M, -1.0)
-    out: Floats = np.concatenate([near, far[(far > near[-1] + 0.5 * ROW_M) & (far <= FARTHEST_M)]])
+    far = fy_px * height_m / np.arange(first, fy_px * height_m / MAX_DISTANCE_M, -1.0)
+    out: Floats = np.concatenate([near, far[(far > near[-1] + 0.5 * ROW_M) & (far <= MAX_DISTANCE_M)]])
     return out
 
 
@@ -124,7 +124,7 @@ def nearest_m(camera: Camera, ground: GroundPlane, bonnet_px: Floats | None) -> 
     lowest = camera.height_px - 1.0
     v = lowest if bonnet_px is None else min(lowest, float(np.interp(camera.cx_px, *bonnet_px.T)))
     x_m = float(bev.pixel_to_ego(camera, ground, np.array([[camera.cx_px, v]]))[0, 0])
-    return x_m if np.isfinite(x_m) else FARTHEST_M
+    return x_m if np.isfinite(x_m) else MAX_DISTANCE_M
 
 
 def _pixels(camera: Camera, ground: GroundPlane, x_m: Floats, y_m: Floats) -> tuple[Grid, Grid]:

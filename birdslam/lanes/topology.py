@@ -18,13 +18,13 @@ from birdslam.lanes.curves import basis
 from birdslam.types import Bound, Lane, LaneLine, LineKind
 
 AT_M = 8.0  # where lanes are judged: in view of most cameras, and near enough to be sure
-LEAST_LANE_M, WIDEST_LANE_M = 2.3, 4.2
+MIN_LANE_M, WIDEST_LANE_M = 2.3, 4.2
 WIDEST_TO_EDGE_M = 5.5  # of a lane that ends at the road's edge, parked cars included
-LEAST_STRIP_M = 0.8  # a hard shoulder, a cycle lane
+MIN_STRIP_M = 0.8  # a hard shoulder, a cycle lane
 NO_LANE_COST = 0.6  # of a strip that is no lane
 WIDE_COST = 0.4  # of a lane wider than most
 PAINT_AT_EDGE_M = 0.6  # nearer to the road's edge than this a painted line is that edge's
-LEAST_KERB_M = 0.1  # so far past the edge; a mask's border wanders about paint
+MIN_KERB_M = 0.1  # so far past the edge; a mask's border wanders about paint
 WIDTH_M, WIDTH_SIGMA_M = 3.4, 0.4  # of a lane nobody has measured
 NARROWEST_M = 1.9  # where no car fits between a lane's lines any more
 STEP_M, SURE_SIGMAS = 2.0, 2.0  # along a lane, in search of its end
@@ -82,15 +82,15 @@ def _bounds(lines: tuple[LaneLine, ...]) -> list[LaneLine]:
 def _is_kerb(line: LaneLine, edge: LaneLine) -> bool:
     """Whether a bright line is a kerbstone: it lies just past the road's edge; paint lies before it."""
     past_m = (line.y_m(AT_M) - edge.y_m(AT_M)) * math.copysign(1.0, edge.y_m(AT_M))
-    return LEAST_KERB_M < past_m < PAINT_AT_EDGE_M
+    return MIN_KERB_M < past_m < PAINT_AT_EDGE_M
 
 
 def _strip_cost(left: LaneLine, right: LaneLine) -> float:
     width = left.y_m(AT_M) - right.y_m(AT_M)
     at_edge = LineKind.EDGE in (left.kind, right.kind)
-    if width < LEAST_STRIP_M:
+    if width < MIN_STRIP_M:
         return 2.0
-    if width < LEAST_LANE_M:
+    if width < MIN_LANE_M:
         return NO_LANE_COST
     if width < (WIDEST_TO_EDGE_M if at_edge else WIDEST_LANE_M):
         return 0.0
@@ -101,7 +101,7 @@ def _is_lane(left: LaneLine, right: LaneLine) -> bool:
     """Whether the strip between two bounds is a lane."""
     width = left.y_m(AT_M) - right.y_m(AT_M)
     edges = (left.kind is LineKind.EDGE) + (right.kind is LineKind.EDGE)
-    if width < LEAST_LANE_M or left.offset_m - right.offset_m < LEAST_STRIP_M:
+    if width < MIN_LANE_M or left.offset_m - right.offset_m < MIN_STRIP_M:
         return False
     if edges == 2:
         return True
@@ -155,7 +155,7 @@ def _ends(width: Floats, cov: Floats, seen_to_m: float) -> tuple[float | None, f
     at = basis(x)
     metres = at @ width
     sure = SURE_SIGMAS * np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", at, cov, at), 0.0))
-    narrow, wide = metres + sure < NARROWEST_M, metres - sure > 2.0 * LEAST_LANE_M
+    narrow, wide = metres + sure < NARROWEST_M, metres - sure > 2.0 * MIN_LANE_M
     ends_m = float(x[np.argmax(narrow)]) if narrow.any() else None
     splits_m = float(x[np.argmax(wide)]) if wide.any() and width[0] < WIDEST_LANE_M else None
     return ends_m, splits_m

@@ -12,7 +12,7 @@ from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import VerticalCurvature
 from birdslam.geometry.se2 import SE2
 from birdslam.lanes.curves import across_sigma_m, basis, moved
-from birdslam.lanes.line_filter import FARTHEST_M, STEEPEST, Tilt
+from birdslam.lanes.line_filter import MAX_DISTANCE_M, STEEPEST, Tilt
 from birdslam.types import LaneLine, LineColour, LineKind
 
 PAINT, LEFT_EDGE, RIGHT_EDGE = 0, 1, 2  # classes of lines: each is seen by points of its own
@@ -22,8 +22,8 @@ WORST_SIGMA_M = 0.6  # to which range a line is predicted
 SIGMA_HEIGHT_REL = 0.02  # of the camera's height, as of landmarks (mapping.StaticMapConfig)
 SIGMA_OFFSET_M = 0.025  # of the paint's middle
 SOLID, DASHED = 0.8, 0.6  # share of a line that is painted
-LEAST_PAINTED = 0.2  # of a dashed line; less of it is an arrow, or a scrap
-DOUBLE, LEAST_RESOLVED = 0.5, 3.0  # share of two stripes of a double line, over so many images: kerbs may show two
+MIN_PAINTED = 0.2  # of a dashed line; less of it is an arrow, or a scrap
+DOUBLE, MIN_RESOLVED = 0.5, 3.0  # share of two stripes of a double line, over so many images: kerbs may show two
 YELLOW = 25.0  # excess of yellow over the road's
 
 AHEAD_M = np.arange(5.0, TO_M + 1.0, 5.0)
@@ -70,7 +70,7 @@ class TrackedLines:
         covs = J @ self.covs @ J.transpose(0, 2, 1) + _systematic(curves, self.height_m, self.sigma_roll_rad)
         known = across_sigma_m(AHEAD[:, None], covs) < WORST_SIGMA_M  # (distances, lines)
         sure = known.any(axis=0) & np.isfinite(covs).all(axis=(1, 2))
-        sure &= (np.abs(curves[:, 0]) <= FARTHEST_M) & (np.abs(curves[:, 1]) <= STEEPEST)
+        sure &= (np.abs(curves[:, 0]) <= MAX_DISTANCE_M) & (np.abs(curves[:, 1]) <= STEEPEST)
         to_m = np.max(np.where(known, AHEAD_M[:, None], 0.0), axis=0)
         numbers = zip(self.tracks, curves.tolist(), covs.reshape(-1, 16).tolist(), to_m.tolist(), strict=True)
         out = [
@@ -114,13 +114,13 @@ def existence_of(track: Track) -> float:
     existence = 1.0 - math.exp(-track.evidence_m / EVIDENCE_M)
     if track.kind != PAINT or not track.looks:
         return existence
-    return existence * min(1.0, track.painted / LEAST_PAINTED)
+    return existence * min(1.0, track.painted / MIN_PAINTED)
 
 
 def _kind(track: Track) -> LineKind:
     if track.kind != PAINT:
         return LineKind.EDGE
-    if track.double > DOUBLE and track.resolved >= LEAST_RESOLVED:
+    if track.double > DOUBLE and track.resolved >= MIN_RESOLVED:
         return LineKind.DOUBLE
     if track.looks < 1.0:
         return LineKind.UNKNOWN

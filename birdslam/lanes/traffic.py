@@ -21,16 +21,16 @@ from birdslam.types import Lane, LaneLine, Lanes
 
 AGAINST = -0.3  # cosine of a direction to the ego's, below which traffic comes towards the ego
 EVIDENCE = 2.0  # log odds that one vehicle adds: one in eight turns, overtakes or is misjudged
-MOST = 6.0  # log odds
+MAX_LOG_ODDS = 6.0  # log odds
 # Log odds that one vehicle adds to whether those beyond a line drive, and their most: kerbs and lanes are side by side,
 # and who is so much farther aside than the other is told about less
-DRIVES_EVIDENCE, DRIVES_MOST = 1.0, 3.0
-ALIKE_M, LEAST_ALIKE = 1.5, 0.3
-LEAST_SIGMA_MPS, MOST_SIGMAS = 0.1, 30.0
+DRIVES_EVIDENCE, DRIVES_MAX = 1.0, 3.0
+ALIKE_M, MIN_ALIKE = 1.5, 0.3
+MIN_SIGMA_MPS, MAX_SIGMAS = 0.1, 30.0
 # Where the ego drives fast nobody parks: log odds that each m/s beyond PARKED_MPS adds to who drives, and their most.
 # Of KITTI tracking's cars beside the ego's lane, each once, 0.58 stand below 14 m/s (of 317; 0.45 to 0.61 with one
 # sequence left out) and 0.34 beyond (of 71; 0.26 to 0.39)
-PARKED_MPS, PARKED_EVIDENCE, PARKED_MOST = 13.0, 0.4, 3.0
+PARKED_MPS, PARKED_EVIDENCE, PARKED_MAX = 13.0, 0.4, 3.0
 BEYOND_SIGMAS = 2.0  # so surely beyond a line
 MEMORY_LINES = 64
 STATED_SIDE = 2.2  # log odds of the side that was stated: a few who come at the other side tell it better
@@ -110,14 +110,14 @@ class Traffic:
         if key not in self._counted:
             self._counted[key] = None
             odds = self._against.pop(line, 0.0) + (EVIDENCE if against else -EVIDENCE)
-            self._against[line] = min(max(odds, -MOST), MOST)
+            self._against[line] = min(max(odds, -MAX_LOG_ODDS), MAX_LOG_ODDS)
             _forget(self._counted)
             _forget(self._against)
         # Who drives along at the ego's left may do so in a lane of its own way
         if against and vehicle not in self._sided:
             self._sided[vehicle] = None
             evidence = math.log(FAR_SIDE[0] / NEAR_SIDE[0])
-            self._right = min(max(self._right + (evidence if at_left else -evidence), -MOST), MOST)
+            self._right = min(max(self._right + (evidence if at_left else -evidence), -MAX_LOG_ODDS), MAX_LOG_ODDS)
             _forget(self._sided)
 
     def way(self, user: UserInEgo, seen: Between | None, ego_mps: float) -> Way:
@@ -125,7 +125,7 @@ class Traffic:
         if user.walks:
             return Way(user.drives, (0.0, 0.0), (0.0, 0.0))
         drives, along = user.drives, user.cos_along
-        more = min(PARKED_EVIDENCE * max(ego_mps - PARKED_MPS, 0.0), PARKED_MOST)
+        more = min(PARKED_EVIDENCE * max(ego_mps - PARKED_MPS, 0.0), PARKED_MAX)
         more += 0.0 if seen is None else self._drive_log_odds(seen)
         if more:
             drives = drives / (drives + (1.0 - drives) * math.exp(-more))
@@ -152,9 +152,9 @@ class Traffic:
         for (line, _), (beyond_m, drives) in self._driving.items():
             if line == seen.line.line:
                 apart = (beyond_m - seen.beyond_m) / ALIKE_M
-                alike = LEAST_ALIKE + (1.0 - LEAST_ALIKE) * math.exp(-0.5 * apart * apart)
+                alike = MIN_ALIKE + (1.0 - MIN_ALIKE) * math.exp(-0.5 * apart * apart)
                 total += alike if drives else -alike
-        return DRIVES_EVIDENCE * min(max(total, -DRIVES_MOST), DRIVES_MOST)
+        return DRIVES_EVIDENCE * min(max(total, -DRIVES_MAX), DRIVES_MAX)
 
     def with_directions(self, lanes: Lanes) -> Lanes:
         """The lanes with the probability that their traffic is oncoming, where something showed it."""
@@ -184,7 +184,7 @@ def stated(drives_on: str) -> TrafficState:
 
 def _sigmas(user: UserInEgo) -> float:
     """How surely it drives forward."""
-    return min(user.speed_mps / max(user.speed_sigma_mps, LEAST_SIGMA_MPS), MOST_SIGMAS)
+    return min(user.speed_mps / max(user.speed_sigma_mps, MIN_SIGMA_MPS), MAX_SIGMAS)
 
 
 def _share(log_odds: float) -> float:

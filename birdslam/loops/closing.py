@@ -18,7 +18,7 @@ import numpy as np
 
 from birdslam.geometry.arrays import Bools, Floats
 from birdslam.geometry.se2 import SE2
-from birdslam.loops.drift import KEPT_M, LEAST_SCALE_REL
+from birdslam.loops.drift import KEPT_M, MIN_SCALE_REL
 from birdslam.loops.keyframe import Link, Placed
 
 DCS_PHI = 5.0  # chi-square at which a loop begins to count less
@@ -28,7 +28,7 @@ ORIGIN_SIGMA = 1e-3, 1e-3, 1e-4, 1e1  # the map's frame is that of its first key
 LOOSE_SIGMA = 1e3, 1e3, 1e1, 1e-1
 FREE_SIGMA = 1e6  # of what a prior says nothing of
 LOOP_SCALE_SIGMA = 1e1  # a place that is seen again tells nothing of odometry's metres there
-LEAST_WAY_M = 0.1  # of a link, over which the scale may change
+MIN_WAY_M = 0.1  # of a link, over which the scale may change
 GNC_COST = 0.5 * 11.3  # half the chi-square beyond which a factor is an outlier: 99 % of three degrees of freedom
 
 
@@ -150,8 +150,8 @@ def _scale_information(links: Sequence[Link]) -> dict[int, float]:
 
 def _scale_process(link: Link) -> tuple[float, float]:
     """Its 1-sigma, and the link's way in lengths over which the error lasts."""
-    way_m = max(math.hypot(link.T_from_to.x_m, link.T_from_to.y_m), LEAST_WAY_M)
-    return max(link.scale_rel, LEAST_SCALE_REL), min(way_m / KEPT_M, 20.0)
+    way_m = max(math.hypot(link.T_from_to.x_m, link.T_from_to.y_m), MIN_WAY_M)
+    return max(link.scale_rel, MIN_SCALE_REL), min(way_m / KEPT_M, 20.0)
 
 
 def _prior(number: int, pose: Any, sigmas: tuple[float, ...]) -> Any:

@@ -18,8 +18,8 @@ LOST_SIGMA_M, LOST_SIGMA_RAD = 0.5, math.radians(1.5)  # a pose less exact than 
 # Odometry between fixes, 1-sigma: along and across as a share of the way, yaw by the root of it
 DRIFT_REL, DRIFT_M, DRIFT_YAW_RAD = 0.02, 0.01, 0.0012
 INVALID_REL, INVALID_YAW_RAD_PER_M = 1.0, 0.02  # of a step that odometry itself calls invalid: any length, any bend
-LEAST_SCALE_REL = 0.012  # 1-sigma of its metric scale, where it calls it surer
-MOST_MPS2 = 10.0  # by which a car changes its velocity: its tyres hold no more
+MIN_SCALE_REL = 0.012  # 1-sigma of its metric scale, where it calls it surer
+MAX_MPS2 = 10.0  # by which a car changes its velocity: its tyres hold no more
 # An error of odometry's scale lasts for CORRELATION_M of way, as in the window's graph, and a part of it for KEPT_M
 CORRELATION_M, KEPT_M = 20.0, 1000.0
 ACROSS_M, ALONG_M = 0.03, 0.01  # of a link, by the root of its way: direction (.005 rad for CORRELATION_M), the rest
@@ -52,7 +52,7 @@ class Steps:
         if before is None:
             return 0.0
         changed_mps = math.hypot(x_mps - before[0], y_mps - before[1])
-        error_m = max(changed_mps - MOST_MPS2 * dt_s, 0.0) * dt_s
+        error_m = max(changed_mps - MAX_MPS2 * dt_s, 0.0) * dt_s
         self.sum_m2 += error_m**2
         return error_m
 
@@ -77,7 +77,7 @@ def link_cov(step: SE2, scale_rel: float, unsure_m2: float = 0.0) -> Floats:
     `unsure_m2`: variance of what is known to be wrong in it (`Steps`).
     """
     way_m = math.hypot(step.x_m, step.y_m)
-    scale_rel = max(scale_rel, LEAST_SCALE_REL)
+    scale_rel = max(scale_rel, MIN_SCALE_REL)
     along_m2 = (ALONG_M**2 + 2.0 * CORRELATION_M * scale_rel**2) * way_m  # as of independent steps, over a long way
     yaw_rad = DRIFT_YAW_RAD * math.sqrt(way_m) + 0.02 * abs(step.yaw_rad)
     yaw_rad2 = yaw_rad**2 + INVALID_YAW_RAD_PER_M**2 * unsure_m2

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from birdslam.geometry.arrays import Floats, Floats32, Ints
 
 DESCRIPTOR_BYTES = 32
-MOST_FEATURES = 900  # of an image
+MAX_FEATURES = 900  # of an image
 SUMMED = 8  # entries of SIFT that each bit adds, and as many that it takes away
 _SEED = 39  # of the random differences; part of the format: another seed is another descriptor
 
@@ -63,10 +63,10 @@ class FeatureExtractor:
         self._kind = kind
         self._differences = _differences()
         if kind is FeatureKind.ORB:
-            self._detector = cv2.ORB_create(MOST_FEATURES, fastThreshold=10)  # type: ignore[attr-defined]
+            self._detector = cv2.ORB_create(MAX_FEATURES, fastThreshold=10)  # type: ignore[attr-defined]
         else:
             self._detector = cv2.SIFT_create(  # type: ignore[attr-defined]
-                MOST_FEATURES, contrastThreshold=0.02, edgeThreshold=12
+                MAX_FEATURES, contrastThreshold=0.02, edgeThreshold=12
             )
 
     def __call__(self, image: NDArray[np.uint8]) -> Features:

@@ -18,15 +18,15 @@ from birdslam.loops.triangulation import Points, View, triangulate
 from birdslam.trajectory import mount_pose
 from birdslam.types import Attitude, Estimate, LaneLine
 
-SPACING_M = 4.0  # between keyframes: with MOST_POINTS below 2 MB a km
-MOST_POINTS = 150
-LEAST_POINTS = 25  # a keyframe with fewer can't be found again
+SPACING_M = 4.0  # between keyframes: with MAX_POINTS below 2 MB a km
+MAX_POINTS = 150
+MIN_POINTS = 25  # a keyframe with fewer can't be found again
 REACH_M = 5.0  # of the frames that triangulate a keyframe's points, before and after it
 LOOK_M, LOOK_NS = 0.4, 500_000_000  # a frame is looked at after so much way, or so much time
 GRID_CELLS = 8, 4
 NODE_AT_M = 6.0  # ahead of the ego: there a line is in view and known best
 NODE_EVERY_M = 2.0
-LEAST_EXISTENCE = 0.5
+MIN_EXISTENCE = 0.5
 HELD_M = 12.0  # from a node to the keyframe that it moves with
 
 
@@ -69,7 +69,7 @@ class LineNodes:
             return
         self._next_m = travelled_m + NODE_EVERY_M
         for line in estimate.lanes.lines:
-            if line.existence >= LEAST_EXISTENCE and line.seen_from_m < NODE_AT_M < line.seen_to_m:
+            if line.existence >= MIN_EXISTENCE and line.seen_from_m < NODE_AT_M < line.seen_to_m:
                 x_m, y_m = (estimate.T_world_ego @ np.array([[NODE_AT_M, line.y_m(NODE_AT_M)]]))[0]
                 self._nodes.append((travelled_m + NODE_AT_M, line, (float(x_m), float(y_m))))
 
@@ -130,7 +130,7 @@ class KeyframeBuilder:
         others = around[:: max(1, -(-len(around) // 12))]  # a dozen are enough
         points = triangulate(self._camera, self._view(look), [self._view(other) for other in others])
         kept = _spread(points, look.features.px[points.feature], (self._camera.width_px, self._camera.height_px))
-        if len(kept) < LEAST_POINTS:
+        if len(kept) < MIN_POINTS:
             return None
         p_ego = points.p_cam_m[kept] @ self._mount[:3, :3].T + self._mount[:3, 3]
         seen = p_ego, points.sigma_depth_rel[kept], look.features.descriptors[points.feature[kept]]
@@ -141,7 +141,7 @@ class KeyframeBuilder:
 
 
 def _spread(points: Points, px: Floats, size_px: tuple[int, int]) -> Ints:
-    """At most MOST_POINTS rows: in turn the best of each cell of the image, by frames that saw it and depth."""
+    """At most MAX_POINTS rows: in turn the best of each cell of the image, by frames that saw it and depth."""
     cells = np.floor(px / size_px * GRID_CELLS).astype(int) @ (1, GRID_CELLS[0])
     quality = np.minimum(points.frames, 8) - 20.0 * points.sigma_depth_rel - points.p_cam_m[:, 2] / 30.0
     order = np.lexsort((-quality, cells))
@@ -149,4 +149,4 @@ def _spread(points: Points, px: Floats, size_px: tuple[int, int]) -> Ints:
     for cell in np.unique(cells):
         mine = order[cells[order] == cell]
         rank[mine] = np.arange(len(mine))
-    return np.sort(np.lexsort((-quality, rank))[:MOST_POINTS])
+    return np.sort(np.lexsort((-quality, rank))[:MAX_POINTS])

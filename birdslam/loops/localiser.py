@@ -15,7 +15,7 @@ import numpy as np
 from birdslam.geometry.arrays import Bools, Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
-from birdslam.loops.drift import LEAST_SCALE_REL, Steps, drift_after, is_exact, moved
+from birdslam.loops.drift import MIN_SCALE_REL, Steps, drift_after, is_exact, moved
 from birdslam.loops.features import Features
 from birdslam.loops.map_pose import MapState
 from birdslam.loops.place_map import PlaceMap
@@ -23,7 +23,7 @@ from birdslam.loops.verification import Fix, locate
 from birdslam.types import Attitude, Estimate
 
 CANDIDATES = 6  # places that are verified by geometry in one frame
-SELDOM_M = 4.0  # of way, from one look-up among all places to the next, for who is on a way that the map does not know
+RARE_M = 4.0  # of way, from one look-up among all places to the next, for who is on a way that the map does not know
 FOUND_INLIERS, FOUND_PLACES = 25, 7  # of a frame that nothing was known of
 FOUND_SHARE = 0.3  # of its matches that must fit
 KEPT_INLIERS, KEPT_PLACES = 18, 6  # of a frame that was foreseen
@@ -35,8 +35,8 @@ HYPOTHESIS_M = 30.0  # after so much way without confirmation one is given up
 CHI2_GATE = 16.27  # of three degrees of freedom, 99.9 %
 FOLLOWED_M = 30.0  # of way since the last fix, along which the ego is looked for where odometry says
 FOLLOW_M = 12.0  # keyframes within it are looked for
-SEARCH_PX, MOST_SEARCH_PX = 25.0, 120.0
-FARTHEST_M, LEAST_STEP_M = 1e5, 0.1
+SEARCH_PX, MAX_SEARCH_PX = 25.0, 120.0
+MAX_DISTANCE_M, MIN_STEP_M = 1e5, 0.1
 # What fixes by one keyframe share, by how far the ego is from it along its axis and aside: its points were seen along
 # the way only, and what their depths have in common shows from aside. That the car tilts is no such error (foot.py),
 # nor that all metres of the map are too long
@@ -105,8 +105,8 @@ class Localiser:
     @property
     def cov(self) -> Floats:
         """(3, 3) of the pose in the map, with what fixes share."""
-        scale_rel = max(MISSED_REL if self._missed else LEAST_SCALE_REL, self._scale_rel)  # all along the way
-        scale_m = scale_rel * min(self.since_fix_m, FARTHEST_M)
+        scale_rel = max(MISSED_REL if self._missed else MIN_SCALE_REL, self._scale_rel)  # all along the way
+        scale_m = scale_rel * min(self.since_fix_m, MAX_DISTANCE_M)
         return self._cov + self._shared + np.diag([scale_m**2, scale_m**2, 0.0])
 
     @property
@@ -176,7 +176,7 @@ class Localiser:
         if not rows:
             return None
         sigma_rad = math.sqrt(cov[2, 2]) + math.sqrt(max(cov[0, 0], cov[1, 1])) / 10.0  # of a point 10 m away
-        radius_px = min(SEARCH_PX + 3.0 * sigma_rad * self._camera.fx_px, MOST_SEARCH_PX)
+        radius_px = min(SEARCH_PX + 3.0 * sigma_rad * self._camera.fx_px, MAX_SEARCH_PX)
         T_keyframe_ego = self.map.keyframes[rows[0]].T_map_keyframe.between(guess)
         fix = None
         for far in (False, True):
@@ -193,7 +193,7 @@ class Localiser:
     def _correct(self, fix: Fix) -> None:
         assert self._T_map_ego is not None
         error = self._T_map_ego.between(fix.T_map_ego).log()
-        fixes = max(SAME_POINTS_M / max(self.since_fix_m, LEAST_STEP_M), 1.0)
+        fixes = max(SAME_POINTS_M / max(self.since_fix_m, MIN_STEP_M), 1.0)
         gain = self._cov @ np.linalg.inv(self._cov + fixes * fix.cov)
         self._T_map_ego = self._T_map_ego @ SE2.exp(gain @ error)
         self._cov = (np.eye(3) - gain) @ self._cov
@@ -227,7 +227,7 @@ class Localiser:
             self._suppose(foreseen, kidnapped=False)
             return False
         unknown = self._T_map_ego is not None and not self._missed  # a street that the map lacks, as of a new map all
-        if unknown and self.travelled_m - self._looked_up_m < SELDOM_M:
+        if unknown and self.travelled_m - self._looked_up_m < RARE_M:
             return False
         self._looked_up_m = self.travelled_m
         for row in self.map.index().look_up(features.descriptors, CANDIDATES, among):

@@ -26,13 +26,13 @@ VERSION = 4
 READ = 2, 3, 4  # 2 had no lines, 3 no scales
 MAGIC = b"BirdSLAM map\n"
 HEAD = struct.Struct("<HQI")  # version, bytes, CRC-32
-MOST_BYTES = 1 << 31  # 1,000 km
-MOST_KEYFRAMES, MOST_KEYFRAME_POINTS = 1_000_000, 2048
-MOST_PIECES, MOST_NODES = 64, 64  # of a keyframe's lines, and of each
-LEAST_SCALE, MOST_SCALE_REL = 0.1, 10.0
+MAX_BYTES = 1 << 31  # 1,000 km
+MAX_KEYFRAMES, MAX_KEYFRAME_POINTS = 1_000_000, 2048
+MAX_PIECES, MAX_NODES = 64, 64  # of a keyframe's lines, and of each
+MIN_SCALE, MAX_SCALE_REL = 0.1, 10.0
 POINT_M = 0.01  # what a point's coordinate is rounded to, in 16 bits
-SIGMA_STEP = 0.04  # of the logarithm of a sigma, from LEAST_SIGMA on, in 8 bits
-LEAST_SIGMA = 1e-4
+SIGMA_STEP = 0.04  # of the logarithm of a sigma, from MIN_SIGMA on, in 8 bits
+MIN_SIGMA = 1e-4
 _POINT_BYTES = 6 + 1 + DESCRIPTOR_BYTES
 
 _Number = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
@@ -138,8 +138,8 @@ def decode_map(data: bytes) -> PlaceMap:
     if version not in READ:
         reads = " and ".join(map(str, READ))
         raise MapError(f"is of version {version}, and this BirdSLAM reads versions {reads}: drive it anew")
-    if length > MOST_BYTES:
-        raise MapError(f"says that it has {length} bytes: more than {MOST_BYTES}")
+    if length > MAX_BYTES:
+        raise MapError(f"says that it has {length} bytes: more than {MAX_BYTES}")
     if len(data) - head != length:
         raise MapError(f"is torn: it has {len(data) - head} bytes behind its head in place of {length}")
     body = data[head:]
@@ -158,8 +158,8 @@ def _map_of(record: MapRecord) -> PlaceMap:
         raise MapError("was made with numbers that are no camera's")
     if not (0 < camera.width_px <= 1 << 16 and 0 < camera.height_px <= 1 << 16):
         raise MapError("was made with numbers that are no camera's")
-    if len(record.keyframes) > MOST_KEYFRAMES:
-        raise MapError(f"has {len(record.keyframes)} keyframes: more than {MOST_KEYFRAMES}")
+    if len(record.keyframes) > MAX_KEYFRAMES:
+        raise MapError(f"has {len(record.keyframes)} keyframes: more than {MAX_KEYFRAMES}")
     if len(record.words) % DESCRIPTOR_BYTES or len(record.words) > DESCRIPTOR_BYTES * (1 << 16):
         raise MapError("has words that are none")
     keyframes = [_keyframe(each) for each in record.keyframes]
@@ -170,7 +170,7 @@ def _map_of(record: MapRecord) -> PlaceMap:
     for link in record.links:
         if link.from_number not in numbers or link.to_number not in numbers:
             raise MapError("links keyframes that it does not have")
-        if not 0.0 <= link.scale_rel <= MOST_SCALE_REL:
+        if not 0.0 <= link.scale_rel <= MAX_SCALE_REL:
             raise MapError("has a link whose scale is none")
         cov = _matrix(link.cov)
         links.append(Link(link.from_number, link.to_number, link.T_from_to, cov, link.loop, link.scale_rel))
@@ -201,7 +201,7 @@ def _earth(record: EarthRecord) -> Earth:
 
 def _keyframe_record(keyframe: Keyframe) -> KeyframeRecord:
     points = np.clip(np.round(keyframe.points_m / POINT_M), -32768, 32767).astype("<i2")
-    steps = np.log(np.maximum(keyframe.sigma_depth_rel, LEAST_SIGMA) / LEAST_SIGMA) / SIGMA_STEP
+    steps = np.log(np.maximum(keyframe.sigma_depth_rel, MIN_SIGMA) / MIN_SIGMA) / SIGMA_STEP
     sigmas = np.clip(np.ceil(steps), 0, 255).astype(np.uint8)
     attitude, fixed = keyframe.attitude, keyframe.gnss
     return KeyframeRecord(
@@ -226,7 +226,7 @@ def _piece_record(piece: LinePiece) -> PieceRecord:
 
 def _piece(record: PieceRecord) -> LinePiece:
     count, rest = divmod(len(record.points), 4)
-    if rest or not 0 < count <= MOST_NODES or not 0.0 <= record.sigma_m < 1e3:
+    if rest or not 0 < count <= MAX_NODES or not 0.0 <= record.sigma_m < 1e3:
         raise MapError(f"line {record.line}: its points are none")
     points_m = np.frombuffer(record.points, "<i2").reshape(-1, 2) * POINT_M
     return LinePiece(record.drive, record.line, record.kind, record.colour, points_m, record.sigma_m)
@@ -234,23 +234,23 @@ def _piece(record: PieceRecord) -> LinePiece:
 
 def _keyframe(record: KeyframeRecord) -> Keyframe:
     count, rest = divmod(len(record.points), _POINT_BYTES)
-    if rest or count > MOST_KEYFRAME_POINTS:
+    if rest or count > MAX_KEYFRAME_POINTS:
         raise MapError(f"keyframe {record.number}: its points are none")
     if not math.isfinite(sum(record.attitude)) or max(map(abs, record.attitude[1:])) > 1.5:
         raise MapError(f"keyframe {record.number}: its attitude is none")
     if not 0.1 < record.camera_height_m < 10.0:
         raise MapError(f"keyframe {record.number}: its camera's height is none")
-    if not LEAST_SCALE < record.scale < 1.0 / LEAST_SCALE:
+    if not MIN_SCALE < record.scale < 1.0 / MIN_SCALE:
         raise MapError(f"keyframe {record.number}: its scale is none")
-    if len(record.lines) > MOST_PIECES:
-        raise MapError(f"keyframe {record.number}: has {len(record.lines)} lines: more than {MOST_PIECES}")
+    if len(record.lines) > MAX_PIECES:
+        raise MapError(f"keyframe {record.number}: has {len(record.lines)} lines: more than {MAX_PIECES}")
     fixed = None if record.gnss is None else Fixed(*record.gnss)
     if fixed is not None and not (
         is_on_earth(fixed.latitude_deg, fixed.longitude_deg) and 0.0 < fixed.sigma_m <= fixed.weighed_m < 1e9
     ):
         raise MapError(f"keyframe {record.number}: its place on Earth is none")
     points = np.frombuffer(record.points, "<i2", 3 * count).reshape(-1, 3) * POINT_M
-    sigmas = LEAST_SIGMA * np.exp(SIGMA_STEP * np.frombuffer(record.points, np.uint8, count, 6 * count))
+    sigmas = MIN_SIGMA * np.exp(SIGMA_STEP * np.frombuffer(record.points, np.uint8, count, 6 * count))
     descriptors = np.frombuffer(record.points, np.uint8, DESCRIPTOR_BYTES * count, 7 * count)
     return Keyframe(
         record.number,

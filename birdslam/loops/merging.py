@@ -19,7 +19,7 @@ from birdslam.loops.place_map import PlaceMap
 from birdslam.loops.verification import Fix, locate
 
 CANDIDATES = 4
-LEAST_MEETINGS = 3  # keyframes that must agree on how the maps lie to each other
+MIN_MEETINGS = 3  # keyframes that must agree on how the maps lie to each other
 AGREE_M, AGREE_RAD = 3.0, math.radians(4.0)
 POINT_SIGMA_PX = 1.0
 
@@ -32,10 +32,10 @@ def merged(first: PlaceMap, second: PlaceMap) -> tuple[PlaceMap, int]:
     """One map in the frame of `first`, and how many keyframes of `second` were found in it. Raises MergeError."""
     meetings = [(own, fix) for own in second.keyframes for fix in [_found(own, first)] if fix is not None]
     agreeing = _agreeing(meetings)
-    if len(agreeing) < LEAST_MEETINGS:
+    if len(agreeing) < MIN_MEETINGS:
         raise MergeError(
             f"the maps share no street that was recognised: {len(agreeing)} of {len(second)} keyframes agree, "
-            f"{LEAST_MEETINGS} are needed"
+            f"{MIN_MEETINGS} are needed"
         )
     number = {keyframe.number: first.next_number + row for row, keyframe in enumerate(second.keyframes)}
     own, fix = agreeing[len(agreeing) // 2]

@@ -18,7 +18,7 @@ from birdslam.loops.features import DESCRIPTOR_BYTES
 from birdslam.loops.verification import MATCH_BITS
 
 # How many words: in a list lie as many descriptors as there are lists, within a factor; faiss advises 4 to 16
-WORDS_PER_ROOT, LEAST_WORDS, MOST_WORDS = 4.0, 16, 2048
+WORDS_PER_ROOT, MIN_WORDS, MAX_WORDS = 4.0, 16, 2048
 LEARNED_FROM = 20_000  # descriptors at the most
 ROUNDS = 5
 AT_A_TIME = 1024  # descriptors, so that a map process does not grow by it
@@ -28,7 +28,7 @@ _SEED = 39
 
 def words_for(descriptors: int) -> int:
     """How many words an index of so many descriptors has."""
-    return int(np.clip(WORDS_PER_ROOT * descriptors**0.5, min(LEAST_WORDS, descriptors), MOST_WORDS))
+    return int(np.clip(WORDS_PER_ROOT * descriptors**0.5, min(MIN_WORDS, descriptors), MAX_WORDS))
 
 
 def learn_words(descriptors: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -26,7 +26,7 @@ from birdslam.types import LineColour, LineKind
 
 NEIGHBOUR_M, NEIGHBOURS = 9.0, 3  # keyframes this near help each other
 FAR_NEIGHBOUR_M, FAR_NEIGHBOURS = 17.0, 7  # and these where that is too little
-MOST_GAP_M = 8.0  # between two pieces of one line
+MAX_GAP_M = 8.0  # between two pieces of one line
 EARTH_REACH_M = 100.0  # a place on Earth is that of the keyframes around it
 SAME_HEADING_RAD = math.radians(60.0)
 OTHER_HEIGHT, OTHER_FOCAL_LENGTH = 0.1, 0.1  # logarithms of ratios
@@ -170,7 +170,7 @@ class PlaceMap:
             for piece in keyframe.lines:
                 points_m = keyframe.T_map_keyframe @ piece.points_m
                 runs = joined.setdefault((piece.drive, piece.line), [])
-                if not runs or math.hypot(*(runs[-1][-1][0][-1] - points_m[0])) > MOST_GAP_M:
+                if not runs or math.hypot(*(runs[-1][-1][0][-1] - points_m[0])) > MAX_GAP_M:
                     runs.append([])
                 runs[-1].append((points_m, piece))
         out = []

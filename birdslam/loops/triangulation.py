@@ -19,10 +19,10 @@ from birdslam.trajectory import Transform, inverse
 
 MATCH_BITS = 60  # neighbouring frames look alike
 MATCH_RATIO = 0.85
-LEAST_FRAMES = 3  # besides the keyframe, that see a point
+MIN_FRAMES = 3  # besides the keyframe, that see a point
 REFINEMENTS = 3
-NEAREST_M, FARTHEST_M = 1.5, 120.0
-MOST_SIGMA_REL = 0.25
+MIN_DISTANCE_M, MAX_DISTANCE_M = 1.5, 120.0
+MAX_SIGMA_REL = 0.25
 GATE = 3.0  # standard deviations of a coordinate
 PRIOR_ROTATION_RAD = 0.002  # of odometry between the frames of a keyframe's window
 PRIOR_TRANSLATION_REL, PRIOR_TRANSLATION_M = 0.01, 0.01
@@ -59,7 +59,7 @@ def triangulate(camera: Camera, keyframe: View, others: Sequence[View]) -> Point
     for refinement in range(REFINEMENTS + 1):
         rho, information = _depths(rays, rho, poses, rows, views, xy, sigma, good)
         error = _residuals(rays, rho, poses, rows, views, xy) / sigma[:, None]
-        good = (np.abs(error).max(axis=1) < (GATE if refinement else 3.0 * GATE)) & (rho[rows] > 1.0 / FARTHEST_M)
+        good = (np.abs(error).max(axis=1) < (GATE if refinement else 3.0 * GATE)) & (rho[rows] > 1.0 / MAX_DISTANCE_M)
         if refinement == REFINEMENTS:
             break
         counts = np.bincount(rows[good], minlength=len(rays))
@@ -71,10 +71,10 @@ def triangulate(camera: Camera, keyframe: View, others: Sequence[View]) -> Point
     sigma_rel = 1.0 / (np.sqrt(np.maximum(information, 1e-12)) * np.maximum(rho, 1e-6))
     # A corner that the keyframe itself saw by a pixel wrong: as one more observation of each depth
     kept = np.flatnonzero(
-        (frames >= LEAST_FRAMES)
-        & (rho > 1.0 / FARTHEST_M)
-        & (rho < 1.0 / NEAREST_M)
-        & (sigma_rel < MOST_SIGMA_REL)
+        (frames >= MIN_FRAMES)
+        & (rho > 1.0 / MAX_DISTANCE_M)
+        & (rho < 1.0 / MIN_DISTANCE_M)
+        & (sigma_rel < MAX_SIGMA_REL)
         & (frames >= 0.6 * np.bincount(rows, minlength=len(rays)))
     )
     return Points(kept, rays[kept] / rho[kept, None], np.maximum(sigma_rel[kept], 0.01), frames[kept])

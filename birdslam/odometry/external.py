@@ -26,7 +26,7 @@ Floats = NDArray[np.float64]
 NotNegative = Annotated[float, msgspec.Meta(ge=0.0)]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 
-_LEAST_S = 1e-6
+_MIN_S = 1e-6
 
 
 class ExternalConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -92,7 +92,7 @@ class ExternalOdometry(WithoutImages):
             step = mount.inverse() @ step @ mount
         T = planar(step, self.camera.ground)
         self._last = frame_id, t_source_ns, pose
-        self._velocity = T, max((t_source_ns - last_ns) / NS_PER_S, _LEAST_S)
+        self._velocity = T, max((t_source_ns - last_ns) / NS_PER_S, _MIN_S)
         return self._motion(last_frame, frame_id, step, T, self._cov(T))
 
     def _coast(self, from_frame: int, from_ns: int, frame_id: int, t_source_ns: int) -> Motion | None:

@@ -18,7 +18,7 @@ from birdslam.geometry.camera import Camera
 FOCAL_PX = 720.0  # that of an image that is made smaller or larger
 LARGEST_FOCAL_PX = 900.0  # with more it is made smaller
 SMALLEST_FOCAL_PX = 600.0  # with less it is made larger
-LEAST_FOCAL_PX = 400.0  # with still less it stays: made larger it would cost four times the time and show little more
+MIN_FOCAL_PX = 400.0  # with still less it stays: made larger it would cost four times the time and show little more
 
 
 class WorkingResolution:
@@ -27,7 +27,7 @@ class WorkingResolution:
     def __init__(self, camera: Camera) -> None:
         focal_px = 0.5 * (camera.fx_px + camera.fy_px)
         self._given = camera
-        self.is_given = SMALLEST_FOCAL_PX <= focal_px <= LARGEST_FOCAL_PX or focal_px < LEAST_FOCAL_PX
+        self.is_given = SMALLEST_FOCAL_PX <= focal_px <= LARGEST_FOCAL_PX or focal_px < MIN_FOCAL_PX
         self._interpolation = cv2.INTER_AREA if focal_px > FOCAL_PX else cv2.INTER_CUBIC
         width_px, height_px = camera.width_px, camera.height_px
         if not self.is_given:

@@ -25,7 +25,7 @@ from birdslam.outputs.final_trajectories import EGO_FILES
 from birdslam.outputs.line_map import LineMap
 from birdslam.outputs.placed import AROUND_FILES, PLACES_FILE, ROAD_IN_MAP, write_around
 from birdslam.outputs.plain_words import DriveCounts, LengthsBy, readme, verdict
-from birdslam.outputs.scene_recorder import MOST_POSES, MOST_TRACKS, SceneRecorder, Thinned
+from birdslam.outputs.scene_recorder import MAX_POSES, MAX_TRACKS, SceneRecorder, Thinned
 from birdslam.trajectory import CameraTrajectory, Transform, ego_pose, kitti_row, tum_row
 from birdslam.types import INVALIDATING, Attitude, Estimate, MapUpdate, Status, VehicleEstimate
 
@@ -112,7 +112,7 @@ class Recorder:
         self._ends_unreadable = False  # the newest picture was damaged or missing
         self._invalid_by: Counter[str] = Counter()
         self._path_m = self._valid_path_m = 0.0
-        self._sigmas = Thinned(1, MOST_POSES)  # of the scale, in valid frames
+        self._sigmas = Thinned(1, MAX_POSES)  # of the scale, in valid frames
         self._last: Estimate | None = None
         self._epoch: int | None = None
         self._epoch_count = 0
@@ -254,7 +254,7 @@ class Recorder:
         with path.open("a", encoding="ascii", errors="backslashreplace") as file:  # so many tracks, so few descriptors
             file.write("\n".join(lines) + "\n")
         self._tracks[vehicle.vehicle] = described, estimate.epoch  # the one seen last stands last
-        if len(self._tracks) > MOST_TRACKS:
+        if len(self._tracks) > MAX_TRACKS:
             del self._tracks[next(iter(self._tracks))]
 
 

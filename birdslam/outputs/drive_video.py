@@ -38,17 +38,17 @@ from birdslam.outputs.bev_picture import (
 from birdslam.outputs.drive_files import ResultsError
 from birdslam.types import Estimate, Lanes, LineKind, MapUpdate, RoadUser
 
-MOST_SCALE, MOST_WIDTH_PX = 1.5, 1280  # of the camera's image, enlarged or reduced
+MAX_SCALE, MAX_WIDTH_PX = 1.5, 1280  # of the camera's image, enlarged or reduced
 STRIP_PX, PANEL_PX = 96, 368  # height of the strip of text below the image, width of the bird's-eye view
 AHEAD_M, BEHIND_M = 50.0, 10.0  # shown of the bird's-eye view
 LANE_ALPHA = 0.18  # of the ego's lane over the image
 BOX_HEIGHT_M = 1.5  # of one whose height is not known
-MOST_POINTS, MOST_POSES = 12_000, 400
+MAX_POINTS, MAX_POSES = 12_000, 400
 SHIFT = 4  # OpenCV's fractional bits: outlines don't jump from pixel to pixel
 RING_M = 10.0
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 SUFFIX, CODEC = ".mp4", "mp4v"  # the codec that every build of OpenCV can write
-MOST_PICTURES_HZ = 20.0  # of the video: of faster cameras every second or third frame is drawn
+MAX_PICTURES_HZ = 20.0  # of the video: of faster cameras every second or third frame is drawn
 
 
 def _bgr(colour: str) -> tuple[int, int, int]:
@@ -60,15 +60,15 @@ class SideBySide:
 
     def __init__(self, camera: Camera) -> None:
         self._camera = camera
-        self._scale = min(MOST_SCALE, MOST_WIDTH_PX / camera.width_px)
+        self._scale = min(MAX_SCALE, MAX_WIDTH_PX / camera.width_px)
         self._image_px = (round(camera.width_px * self._scale), round(camera.height_px * self._scale))
         self.size_px = self._image_px[0] + PANEL_PX, self._image_px[1] + STRIP_PX  # width, height; both even
         self.size_px = self.size_px[0] // 2 * 2, self.size_px[1] // 2 * 2
         self._per_m = self.size_px[1] / (AHEAD_M + BEHIND_M)
         self._epoch: int | None = None
-        self._lanes: deque[tuple[float, float]] = deque(maxlen=MOST_POINTS)
-        self._landmarks: deque[tuple[float, float]] = deque(maxlen=MOST_POINTS)
-        self._way: deque[tuple[float, float]] = deque(maxlen=MOST_POSES)
+        self._lanes: deque[tuple[float, float]] = deque(maxlen=MAX_POINTS)
+        self._landmarks: deque[tuple[float, float]] = deque(maxlen=MAX_POINTS)
+        self._way: deque[tuple[float, float]] = deque(maxlen=MAX_POSES)
 
     def add_map(self, update: MapUpdate) -> None:
         """Points in world of the update's epoch."""
@@ -215,7 +215,7 @@ class DriveVideo:
         truth: Callable[[int], Sequence[Floats]] | None = None,
     ) -> None:
         self._view = SideBySide(camera)
-        self._every = math.ceil(rate_hz / MOST_PICTURES_HZ)
+        self._every = math.ceil(rate_hz / MAX_PICTURES_HZ)
         self._frames, self._truth = frames, truth
         self._next: tuple[int, int, Image | None] | None = None
         self._estimate: Estimate | None = None

@@ -15,12 +15,12 @@ import numpy as np
 
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
-from birdslam.loops.keyframe_builder import LEAST_EXISTENCE, NODE_AT_M, NODE_EVERY_M
+from birdslam.loops.keyframe_builder import MIN_EXISTENCE, NODE_AT_M, NODE_EVERY_M
 from birdslam.types import NS_PER_S, Estimate, LaneLine
 
-LEAST_NODES = 3
+MIN_NODES = 3
 ENDED_NS = 3 * NS_PER_S  # a line not seen for so long has ended
-MOST_DRAWN = 20_000  # vertices for the picture
+MAX_DRAWN = 20_000  # vertices for the picture
 TAIL_M = 30.0  # what lies ahead when a drive ends
 
 
@@ -67,7 +67,7 @@ class LineMap:
         self._way_m = 0.0
         widths = {lane.left: lane.width_m for lane in lanes.lanes if lane.left is not None}
         for line in lanes.lines:
-            if line.existence >= LEAST_EXISTENCE and line.seen_from_m < NODE_AT_M < line.seen_to_m:
+            if line.existence >= MIN_EXISTENCE and line.seen_from_m < NODE_AT_M < line.seen_to_m:
                 self._add_node(estimate, line, widths.get(line.line), T_picture_world)
         self._end([p for p in self._open.values() if estimate.t_source_ns - p.last_ns > ENDED_NS])
 
@@ -82,10 +82,10 @@ class LineMap:
     def _end(self, polylines: list[_Polyline]) -> None:
         for polyline in polylines:
             del self._open[polyline.line]
-            if len(polyline.points_m) >= LEAST_NODES:
+            if len(polyline.points_m) >= MIN_NODES:
                 self._file.write(("\n" if self._first else ",\n") + json.dumps(_feature(polyline)))
                 self._first = False
-                if self._drawn_count < MOST_DRAWN:
+                if self._drawn_count < MAX_DRAWN:
                     self._drawn.append(polyline.T_picture_world @ np.array(polyline.points_m))
                     self._drawn_count += len(polyline.points_m)
 

@@ -24,8 +24,8 @@ from birdslam.trajectory import ego_pose, tum_row
 from birdslam.types import NS_PER_S, Estimate
 
 FILES = "map.tum.txt", "localisation.csv"
-MOST_BACK_M = 15.0  # of way by odometry alone, back from where a place was confirmed
-MOST_WAITING = 3000  # frames of an ego that stands somewhere unknown
+MAX_BACK_M = 15.0  # of way by odometry alone, back from where a place was confirmed
+MAX_WAITING = 3000  # frames of an ego that stands somewhere unknown
 HEADER = "t_s,state,x_m,y_m,yaw_rad,cov_xx,cov_xy,cov_xyaw,cov_yy,cov_yyaw,cov_yawyaw,inliers,map_epoch"
 
 
@@ -62,7 +62,7 @@ class MapTrajectory:
             self._lead_back()
             return self.finish()
         out = []
-        while len(self._waiting) > MOST_WAITING or self._too_far(moment):
+        while len(self._waiting) > MAX_WAITING or self._too_far(moment):
             out.append(self._waiting.popleft()[0])
         return self._settled(out)
 
@@ -75,7 +75,7 @@ class MapTrajectory:
     def _too_far(self, newest: _Moment) -> bool:
         _, first = self._waiting[0]
         step = first.T_world_ego.between(newest.T_world_ego)
-        return first.epoch != newest.epoch or math.hypot(step.x_m, step.y_m) > MOST_BACK_M
+        return first.epoch != newest.epoch or math.hypot(step.x_m, step.y_m) > MAX_BACK_M
 
     def _settled(self, rows: list[Localisation]) -> list[Localisation]:
         for row in rows:
@@ -91,7 +91,7 @@ class MapTrajectory:
             step = later.T_world_ego.between(moment.T_world_ego)
             way_m += math.hypot(step.x_m, step.y_m)
             cov = moved(cov, step, later.valid, later.scale_sigma_rel)
-            if moment.epoch != newest.epoch or way_m > MOST_BACK_M or not is_exact(cov):
+            if moment.epoch != newest.epoch or way_m > MAX_BACK_M or not is_exact(cov):
                 return
             T_map_ego = found.T_map_ego @ newest.T_world_ego.between(moment.T_world_ego)
             led = Localisation(

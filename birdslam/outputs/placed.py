@@ -28,7 +28,7 @@ COLUMNS = (
     *("latitude_deg", "longitude_deg", "yaw_from_east_rad", "earth_over_map"),
 )
 AROUND_FILES = (PLACES_FILE, ROAD_IN_MAP, *(f"{name}{suffix}" for name in ("road", "tracks") for suffix in SUFFIXES))
-MOST_TOGETHER = 50_000  # points of one feature
+MAX_TOGETHER = 50_000  # points of one feature
 SLACK_S = 5.0  # around the time in which something was seen, of the places that it may have been seen from
 
 
@@ -180,7 +180,7 @@ def _points(path: Path) -> Iterator[tuple[str, int, Floats]]:
                 key = row["kind"], int(row["epoch"])
                 points = found.setdefault(key, [])
                 points.append((float(row["x_m"]), float(row["y_m"])))
-                if len(points) == MOST_TOGETHER:
+                if len(points) == MAX_TOGETHER:
                     yield *key, np.array(found.pop(key))
     for (kind, epoch), points in found.items():
         yield kind, epoch, np.array(points)

@@ -12,7 +12,7 @@ from birdslam.geometry.se2 import SE2
 from birdslam.outputs.bev_picture import Scene, Track
 from birdslam.types import PEOPLE, Estimate, MapUpdate, Moves, RoadUser
 
-MOST_POSES, MOST_TRACK_POSES, MOST_POINTS, MOST_TRACKS = 4000, 100, 20_000, 200  # under 3 MB in all
+MAX_POSES, MAX_TRACK_POSES, MAX_POINTS, MAX_TRACKS = 4000, 100, 20_000, 200  # under 3 MB in all
 
 
 class Thinned:
@@ -50,8 +50,8 @@ class Thinned:
 
 class _TrackHistory:
     def __init__(self) -> None:
-        self.poses = Thinned(3, MOST_TRACK_POSES, begin=16)
-        self.speeds = Thinned(1, MOST_TRACK_POSES, begin=16)
+        self.poses = Thinned(3, MAX_TRACK_POSES, begin=16)
+        self.speeds = Thinned(1, MAX_TRACK_POSES, begin=16)
         self.farthest_m = 0.0
 
 
@@ -61,8 +61,8 @@ class SceneRecorder:
     def __init__(self) -> None:
         self.T_picture_world = SE2()  # of the newest epoch
         self._last: Estimate | None = None
-        self._ego, self._breaks = Thinned(3, MOST_POSES), Thinned(2, MOST_POSES)
-        self._lanes, self._landmarks = Thinned(2, MOST_POINTS), Thinned(2, MOST_POINTS)
+        self._ego, self._breaks = Thinned(3, MAX_POSES), Thinned(2, MAX_POSES)
+        self._lanes, self._landmarks = Thinned(2, MAX_POINTS), Thinned(2, MAX_POINTS)
         self._tracks: dict[int, tuple[_TrackHistory, RoadUser, SE2]] = {}  # with the last estimate, and where it is
 
     def add(self, estimate: Estimate) -> None:
@@ -87,7 +87,7 @@ class SceneRecorder:
         history = self._tracks.pop(user.vehicle)[0] if user.vehicle in self._tracks else _TrackHistory()
         placed = self.T_picture_world @ user.T_world_vehicle
         self._tracks[user.vehicle] = history, user, placed  # the one seen last stands last
-        if len(self._tracks) > MOST_TRACKS:
+        if len(self._tracks) > MAX_TRACKS:
             del self._tracks[next(iter(self._tracks))]
         history.poses.add(*_numbers(placed))
         seen_from = estimate.T_world_ego.between(user.T_world_vehicle)

@@ -24,7 +24,7 @@ from birdslam.people.people_state import FOOT, HEAD, HEIGHT, KERB, STATES, TILT
 
 BEARING, BOTTOM, TALL, WIDTH = range(4)
 UNUSED = 1e3  # 1-sigma of what is not measured
-NEAREST_M = 0.7
+MIN_DISTANCE_M = 0.7
 MIN_SLOPE = 1e-3
 
 
@@ -52,8 +52,8 @@ def expected_boxes(
     """
     R = T_world_ego.rotation()
     in_ego = (x[..., :2] - [T_world_ego.x_m, T_world_ego.y_m]) @ R
-    depth, y = np.maximum(in_ego[..., 0], NEAREST_M), in_ego[..., 1]
-    foot = np.maximum(depth - reach_m[:, None, None], 0.5 * NEAREST_M)
+    depth, y = np.maximum(in_ego[..., 0], MIN_DISTANCE_M), in_ego[..., 1]
+    foot = np.maximum(depth - reach_m[:, None, None], 0.5 * MIN_DISTANCE_M)
     height, below = np.exp(x[..., HEIGHT]), road.height_m + x[..., KERB]
     expected, J = np.empty((*x.shape[:3], 4)), np.zeros((*x.shape[:3], 4, len(STATES)))
     expected[..., BEARING] = y / depth

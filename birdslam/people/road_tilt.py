@@ -16,7 +16,7 @@ import numpy as np
 
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.bev import RoadProfile
-from birdslam.people.box_model import MIN_SLOPE, NEAREST_M
+from birdslam.people.box_model import MIN_DISTANCE_M, MIN_SLOPE
 from birdslam.people.people_boxes import PersonBox
 from birdslam.people.people_config import PeopleConfig
 
@@ -33,7 +33,7 @@ def samples_of(boxes: Sequence[PersonBox], road: RoadProfile, config: PeopleConf
             continue
         sizes = config.sizes(box.label)
         depth = sizes.height_m / box.tan_height
-        tilt = road.slope(max(depth - sizes.reach_m, NEAREST_M), config.kerb_m) - box.slope_bottom
+        tilt = road.slope(max(depth - sizes.reach_m, MIN_DISTANCE_M), config.kerb_m) - box.slope_bottom
         slope = road.height_m / depth
         of_size = config.own_height_var(sizes.sigma_height_rel) + (2.0 * config.sigma_outline_rel) ** 2
         variance = slope**2 * of_size + (config.sigma_kerb_m / depth) ** 2

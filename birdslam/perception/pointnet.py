@@ -27,7 +27,7 @@ from birdslam.perception.pointnet_manifest import Bins, Body, PointNetManifest, 
 
 CORE = 0.5  # of a box's width and height, about its middle: where its vehicle is
 REACH_M = 8.0  # from the depth of the core: points farther off are of another body or the background
-LEAST_POINTS = 16
+MIN_POINTS = 16
 REFERENCE_M = 20.0  # of the feature log_depth
 MIN_HALF_SPAN = 1e-6  # of a box, at a depth of 1
 
@@ -49,14 +49,14 @@ class Frustum:
 
 def frustum_of(points_cam_m: Floats, points: Points) -> Frustum | None:
     """Selects the points (N, 3) of one box near its body, rotates and centres them; None where there are too few."""
-    if len(points_cam_m) < LEAST_POINTS:
+    if len(points_cam_m) < MIN_POINTS:
         return None
     u, v = points_cam_m[:, 0] / points_cam_m[:, 2], points_cam_m[:, 1] / points_cam_m[:, 2]
     offsets = [(w - (w.min() + w.max()) / 2.0) / max((w.max() - w.min()) / 2.0, MIN_HALF_SPAN) for w in (u, v)]
     core = (np.abs(offsets[0]) <= CORE) & (np.abs(offsets[1]) <= CORE)
     depth_m = float(np.median(points_cam_m[core, 2])) if core.any() else float(np.median(points_cam_m[:, 2]))
     near = np.flatnonzero(np.abs(points_cam_m[:, 2] - depth_m) <= REACH_M)
-    if len(near) < LEAST_POINTS or depth_m <= 0.0:
+    if len(near) < MIN_POINTS or depth_m <= 0.0:
         return None
     picked = near[np.arange(points.count) * len(near) // points.count]  # evenly, in the order of the pixels
     middle_u, middle_v = (u.min() + u.max()) / 2.0, (v.min() + v.max()) / 2.0

@@ -17,10 +17,10 @@ from birdslam.geometry.arrays import Bools
 SHRINK = 4  # downscaling: single blades and the camera's noise do not count
 # Above the road's level, of a pixel that shows grass. On five images of KITTI tracking 0005 the lane's pixels lie
 # within 0.03 of their median, and 19 of 20 of the verge's 0.1 to 0.3 above it
-LEAST_EXCESS = 0.06
+MIN_EXCESS = 0.06
 ROAD_SHARE = 0.3  # the road's level is this quantile of the mask, of which 70 % may be grass
 DARKEST = 60.0  # of R + G + B: darker pixels have no reliable colour
-LEAST_PIXELS = 50  # of a downscaled mask, for the level
+MIN_PIXELS = 50  # of a downscaled mask, for the level
 
 
 def without_verge(road: Bools, image: NDArray[np.uint8]) -> Bools:
@@ -38,14 +38,14 @@ def without_verge(road: Bools, image: NDArray[np.uint8]) -> Bools:
     excess = 3.0 * green / np.maximum(sums, 1.0) - 1.0  # 2 g - r - b, since r + g + b = 1
     coloured = road[part][SHRINK // 2 :: SHRINK, SHRINK // 2 :: SHRINK] & (sums > DARKEST)
     excess_road = excess[coloured]
-    if len(excess_road) < LEAST_PIXELS:
+    if len(excess_road) < MIN_PIXELS:
         return road
     at = int(ROAD_SHARE * len(excess_road))
     level = max(
         float(np.partition(excess_road, at)[at]), 0.0
     )  # red bricks and cars in a mask must not make a grey road count as green
     # A single pixel is a leaf on the road, or a marking's fringe
-    grass = cv2.medianBlur((coloured & (excess > level + LEAST_EXCESS)).view(np.uint8), 3)
+    grass = cv2.medianBlur((coloured & (excess > level + MIN_EXCESS)).view(np.uint8), 3)
     out = road.copy()
     size = SHRINK * columns, SHRINK * rows
     out[part] &= cv2.resize(grass, size, interpolation=cv2.INTER_NEAREST) == 0

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 NO_HASH = "TypeHashNotSupported"  # what Humble has in place of a type's hash
 GID_BYTES = 16
-MOST_DOMAIN = 232  # of ROS 2
+MAX_DOMAIN = 232  # of ROS 2
 _NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _TYPE = re.compile(r"([a-z][a-z0-9_]*)::msg::dds_::([A-Za-z0-9]+)_")
 _ATTACHMENT = struct.Struct(f"<qqB{GID_BYTES}s")

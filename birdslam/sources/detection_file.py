@@ -26,7 +26,7 @@ COCO_LAST = 90
 # KITTI's types: who is on a road, and what else its text may name, which has no meaning here
 KITTI = {"Car": "car", "Van": "van", "Truck": "truck", "Pedestrian": "person", "Person": "person", "Cyclist": "cyclist"}
 KITTI_OTHERS = ("Person_sitting", "Tram", "Misc", "DontCare")
-_MOST_BYTES = 1 << 30
+_MAX_BYTES = 1 << 30
 _MOT_COLUMNS, _KITTI_COLUMNS, _KITTI_SCORE = 7, 10, 17
 
 
@@ -44,8 +44,8 @@ def read_detection_file(path: Path, detector: Family | EdgeSigma = "unknown") ->
     `detector` is as of `external_detections`.
     """
     try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise DatasetError(f"{path}: is larger than {_MOST_BYTES >> 30} GiB")
+        if path.stat().st_size > _MAX_BYTES:
+            raise DatasetError(f"{path}: is larger than {_MAX_BYTES >> 30} GiB")
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(f"{path}: can't be read: {getattr(error, 'strerror', None) or 'not UTF-8'}") from None

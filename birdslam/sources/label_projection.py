@@ -18,8 +18,8 @@ from birdslam.geometry.camera import Camera
 from birdslam.trajectory import Transform, inverse
 
 DONT_CARE = "DontCare"  # a region without a body
-NEAREST_M = 0.1  # what lies nearer to the camera's plane, or behind it, has no image
-LEAST_INSIDE = 0.98  # of a hull's area: with less of it in the image the object is truncated
+MIN_DISTANCE_M = 0.1  # what lies nearer to the camera's plane, or behind it, has no image
+MIN_INSIDE = 0.98  # of a hull's area: with less of it in the image the object is truncated
 # A cuboid's corners by (length, height, width), and its edges: pairs of corners that differ in one of them
 _CORNERS = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-1.0, 0.0) for z in (-0.5, 0.5)])
 _EDGES = np.array([(i, j) for i in range(8) for j in range(i) if np.count_nonzero(_CORNERS[i] != _CORNERS[j]) == 1])
@@ -58,7 +58,7 @@ def project_labels(labels: Iterable[Label], camera: Camera, T_cam0_camera: Trans
             inside = float(np.prod(high - low) / np.prod(hull[2:] - hull[:2]))
             if inside > 0.0:
                 box = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-                out.append(replace(label, box_px=box, truncated=float(inside < LEAST_INSIDE)))
+                out.append(replace(label, box_px=box, truncated=float(inside < MIN_INSIDE)))
     return out
 
 
@@ -70,14 +70,14 @@ def hull_px(label: Label, camera: Camera, T_cam0_camera: Transform) -> Floats | 
     T_camera_cam0 = inverse(T_cam0_camera)
     corners = p_cam0 @ T_camera_cam0[:3, :3].T + T_camera_cam0[:3, 3]
     ends = corners[_EDGES]  # (12, 2, 3)
-    near = ends[:, :, 2] < NEAREST_M
+    near = ends[:, :, 2] < MIN_DISTANCE_M
     ends = ends[~near.all(axis=1)]
     if not len(ends):
         return None
     for edge in ends:  # an edge through the camera's plane begins in front of it
         (a, b) = edge if edge[0, 2] < edge[1, 2] else edge[::-1]
-        if a[2] < NEAREST_M:
-            a += (NEAREST_M - a[2]) / (b[2] - a[2]) * (b - a)
+        if a[2] < MIN_DISTANCE_M:
+            a += (MIN_DISTANCE_M - a[2]) / (b[2] - a[2]) * (b - a)
     points = ends.reshape(-1, 3)
     u = camera.fx_px * points[:, 0] / points[:, 2] + camera.cx_px
     v = camera.fy_px * points[:, 1] / points[:, 2] + camera.cy_px

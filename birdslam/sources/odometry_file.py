@@ -15,7 +15,7 @@ from birdslam.sources.recording import DatasetError, Recording, check_times
 from birdslam.trajectory import as_poses, read_kitti, read_tum
 from birdslam.types import NS_PER_S
 
-LEAST_POSES = 2
+MIN_POSES = 2
 _KITTI_NUMBERS = 12
 
 
@@ -35,8 +35,8 @@ def read_odometry(path: Path) -> TimedPoses:
             trajectory = TimedPoses(poses, np.round(t_s * NS_PER_S).astype(np.int64))
     except ValueError as error:
         raise DatasetError(str(error)) from None
-    if len(trajectory.poses) < LEAST_POSES:
-        raise DatasetError(f"{path}: holds {len(trajectory.poses)} poses, {LEAST_POSES} are needed")
+    if len(trajectory.poses) < MIN_POSES:
+        raise DatasetError(f"{path}: holds {len(trajectory.poses)} poses, {MIN_POSES} are needed")
     if trajectory.t_ns is not None:
         back = np.flatnonzero(np.diff(trajectory.t_ns) <= 0)
         if back.size:

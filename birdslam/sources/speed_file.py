@@ -24,8 +24,8 @@ from birdslam.types import NS_PER_S, SpeedReading
 SIGMA_MPS = 0.1
 YAW_RATE_SIGMA_RADPS = 0.01
 
-_MOST_COLUMNS = 5
-_MOST_S = 9e9  # a time in ns has 63 bits
+_MAX_COLUMNS = 5
+_MAX_S = 9e9  # a time in ns has 63 bits
 
 
 def read_speeds(path: Path) -> SpeedLog:
@@ -96,7 +96,7 @@ def _lines(path: Path) -> Iterator[tuple[int, SpeedReading]]:
 def _reading(words: list[str]) -> SpeedReading:
     """Raises ValueError for what is no reading."""
     t_s, speed_mps, *rest = (float(word) if word.strip() else None for word in words)
-    if t_s is None or speed_mps is None or not abs(t_s) < _MOST_S or len(words) > _MOST_COLUMNS:
+    if t_s is None or speed_mps is None or not abs(t_s) < _MAX_S or len(words) > _MAX_COLUMNS:
         raise ValueError
     sigma_mps, yaw_rate_radps, yaw_rate_sigma_radps = (*rest, None, None, None)[:3]
     if yaw_rate_radps is not None and yaw_rate_sigma_radps is None:

@@ -12,7 +12,7 @@ from birdslam.types import NS_PER_S, SpeedReading
 
 KEPT_NS = NS_PER_S  # a frame carries the readings of so long before it
 KEPT_READINGS = 200  # and no more of them: the newest
-_MOST_NS = (1 << 63) - 1
+_MAX_NS = (1 << 63) - 1
 
 
 class SpeedLog:
@@ -34,7 +34,7 @@ class SpeedLog:
 
 def shifted(reading: SpeedReading, by_ns: int) -> SpeedReading:
     """On another clock, `by_ns` ahead; a time that its sender got wrong is clamped to 63 bits."""
-    return msgspec.structs.replace(reading, t_ns=max(-_MOST_NS, min(reading.t_ns + by_ns, _MOST_NS)))
+    return msgspec.structs.replace(reading, t_ns=max(-_MAX_NS, min(reading.t_ns + by_ns, _MAX_NS)))
 
 
 def added(before: tuple[SpeedReading, ...], after: tuple[SpeedReading, ...]) -> tuple[SpeedReading, ...]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
-from birdslam.vehicles.placement.localisation import NEAREST_M, Observation
+from birdslam.vehicles.placement.localisation import MIN_DISTANCE_M, Observation
 from birdslam.vehicles.track import Track
 
 MAX_SIGMA_HEIGHT_REL = 0.2  # of a box's height, as a fraction; past it the box measures no size
@@ -37,7 +37,7 @@ def predicted_boxes_px(
     then = np.array([in_ego(track.frame.T_world_ego, track.state[:2]) for track in tracks])
     step = T_world_ego.inverse() @ centres - then
     depth = np.array([track.place.depth_m for track in tracks])
-    ahead = depth + step[:, 0] >= NEAREST_M
+    ahead = depth + step[:, 0] >= MIN_DISTANCE_M
     if not ahead.any():
         return boxes
     step, depth = step[ahead], depth[ahead, None]

@@ -36,7 +36,7 @@ _KERB_M, _CROWN_RAD, _BANK_PER_M = 0.06, 0.007, 0.001  # in the ego's lane, in p
 _CURVATURE_PER_M = 0.0006
 # What stands beside the road on one side has a bank in common: by 0.05 rad in a street with one (docs/constants.md)
 BANK_RAD, _ROAD_HALF_WIDTH_M = 0.05, 6.0
-_LEAST_INVERSE_DEPTH = 1e-3  # 1/m
+_MIN_INVERSE_DEPTH = 1e-3  # 1/m
 _BOX_MEMORY_S = 0.5  # as in ParallaxConfig
 STATES = 5  # H, d_pitch, d_roll, bank at the left and at the right: the first columns of `jacobian`
 _OWN = [0, 5]  # its columns in which a vehicle has errors of its own
@@ -73,7 +73,7 @@ class BoxHeight:
 
 def jacobian(inverse_depth: Floats, bearing: Floats) -> Floats:
     """(N, 6) of the slopes of boxes' bottoms by `STATES`, and by the road's vertical curvature up to the vehicle."""
-    z = 1.0 / np.maximum(inverse_depth, _LEAST_INVERSE_DEPTH)
+    z = 1.0 / np.maximum(inverse_depth, _MIN_INVERSE_DEPTH)
     beyond = np.maximum(np.abs(bearing) - _ROAD_HALF_WIDTH_M * inverse_depth, 0.0)
     banks = beyond * (bearing > 0.0), beyond * (bearing < 0.0)
     return np.column_stack([inverse_depth, -np.ones(len(z)), bearing, *banks, 0.5 * z])

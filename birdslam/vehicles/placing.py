@@ -20,7 +20,7 @@ from birdslam.geometry.se2 import SE2, wrap
 from birdslam.vehicles.association import in_ego
 from birdslam.vehicles.placement.depth_fusion import DepthPlace, PseudoLidarConfig, fuse
 from birdslam.vehicles.placement.localisation import (
-    NEAREST_M,
+    MIN_DISTANCE_M,
     AssumedSize,
     LocalisationConfig,
     Observation,
@@ -89,7 +89,7 @@ class Assignment:
         if self.track is None:
             return self.observation.depth_by_height_m
         reach_m = float(self.track.place.centre_m[0]) - self.track.place.depth_m
-        return max(NEAREST_M, in_ego(T_world_ego, self.track.state[:2])[0] - reach_m)
+        return max(MIN_DISTANCE_M, in_ego(T_world_ego, self.track.state[:2])[0] - reach_m)
 
     def turned_rad(self, T_world_ego: SE2) -> float:
         """By how much the line of sight to it turned over the ground since it was last seen."""

@@ -22,7 +22,7 @@ from birdslam.types import MotionEdge
 from birdslam.vehicles.association import at_border, by_track_id, predicted_boxes_px, with_track_ids, within_gate
 from birdslam.vehicles.placement.depth_fusion import DepthPlace, PseudoLidarConfig
 from birdslam.vehicles.placement.localisation import (
-    NEAREST_M,
+    MIN_DISTANCE_M,
     LocalisationConfig,
     Observation,
     Place,
@@ -219,7 +219,7 @@ class Tracker:
         R = T_world_ego.rotation()
         ahead, aside = np.einsum("ji,njk,ki->in", R, np.array([track.cov[2:, 2:] for track in self.tracks]), R)
         sight = (np.array([track.state[:2] for track in self.tracks]) - [T_world_ego.x_m, T_world_ego.y_m]) @ R
-        depth_m = np.maximum(sight[:, 0], NEAREST_M)
+        depth_m = np.maximum(sight[:, 0], MIN_DISTANCE_M)
         nearer = UNSURE_SIGMA * np.sqrt(ahead) * unseen_s / depth_m  # relative
         shift_px = UNSURE_SIGMA * np.sqrt(aside) * unseen_s / depth_m * self.camera.fx_px
         shift = np.minimum(shift_px / np.maximum(predicted_px[:, 2] - predicted_px[:, 0], 1.0), 1.0)

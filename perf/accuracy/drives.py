@@ -37,8 +37,8 @@ SEQUENCES = (
     "kitti_odometry/sequences/06",
     "kitti_tracking/training/image_03/0005",
 )
-LEAST_IMAGES = 13  # of a start near the end of a sequence, which has no more
-LEAST_WAY_M = 2.0  # of a start: a standing car has no scale
+MIN_IMAGES = 13  # of a start near the end of a sequence, which has no more
+MIN_WAY_M = 2.0  # of a start: a standing car has no scale
 SCALE_LIMIT, SPEED_LIMIT, SPEED_FLOOR_M = 0.05, 0.1, 0.05  # the floor: a true step is known to a few centimetres
 _MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
 
@@ -177,7 +177,7 @@ def errors(drive: Drive, over: range, estimated: Floats, motions: Sequence[Motio
     """What `follow` gave against the truth; None where the car does not move."""
     truth = drive.poses[over.start : over.stop]
     way, true_way = (_way_m(track) for track in (estimated, truth))
-    if true_way[-1] < LEAST_WAY_M:
+    if true_way[-1] < MIN_WAY_M:
         return None
     turned = inverse(inverse(truth[0]) @ truth) @ estimated
     rotation_deg = np.degrees(Rotation.from_matrix(turned[:, :3, :3]).magnitude())

@@ -25,7 +25,7 @@ import numpy as np
 from birdslam.geometry.pose import Pose
 from birdslam.odometry.motion import Motion, planar
 from birdslam.perf.accuracy.drives import (
-    LEAST_IMAGES,
+    MIN_IMAGES,
     SCALE_LIMIT,
     SPEED_LIMIT,
     Drive,
@@ -72,12 +72,12 @@ def run(arguments: list[str]) -> None:
     parser.add_argument("--every", type=int, default=20, help="images from one cold start to the next")
     parser.add_argument("--images", type=int, default=25, help="of each cold start")
     options = parser.parse_args(arguments)
-    if options.every < 1 or options.images < LEAST_IMAGES or not 1 <= options.quality <= 100:
-        raise PerfError(f"--every must be at least 1, --images {LEAST_IMAGES}, --quality 1 to 100")
+    if options.every < 1 or options.images < MIN_IMAGES or not 1 <= options.quality <= 100:
+        raise PerfError(f"--every must be at least 1, --images {MIN_IMAGES}, --quality 1 to 100")
     if min(options.begin_at) < 0:
         raise PerfError(f"--begin-at {min(options.begin_at)}: images are counted from 0")
-    if options.frames is not None and options.frames < LEAST_IMAGES:
-        raise PerfError(f"--frames must be at least {LEAST_IMAGES}")
+    if options.frames is not None and options.frames < MIN_IMAGES:
+        raise PerfError(f"--frames must be at least {MIN_IMAGES}")
     if not 160 <= options.width <= 4096:
         raise PerfError(f"--width {options.width}: expected 160 to 4096")
     cv2.setNumThreads(1)
@@ -175,15 +175,15 @@ def measure(
     count = len(drive.images)
     ways, motions = [], []
     for first in begin_at:
-        if first > count - LEAST_IMAGES:
-            raise DatasetError(f"begun at image {first} of {count}: {LEAST_IMAGES} are needed")
+        if first > count - MIN_IMAGES:
+            raise DatasetError(f"begun at image {first} of {count}: {MIN_IMAGES} are needed")
         estimated, seen = follow(drive, range(first, count))
         way = errors(drive, range(first, count), estimated, seen)
         if way is None:
             raise DatasetError("the car of this drive does not move")
         ways.append(way)
         motions += seen
-    firsts = range(0, count - LEAST_IMAGES + 1, every) if every else range(0)
+    firsts = range(0, count - MIN_IMAGES + 1, every) if every else range(0)
     starts = [cold_start(drive, range(first, min(first + images, count))) for first in firsts]
     driven_s = (drive.t_ns[-1] - drive.t_ns[begin_at[0]]) * 1e-9
     return {

@@ -20,7 +20,7 @@ import numpy as np
 from birdslam.bench.ego import truth_quality
 from birdslam.perception import ModelError
 from birdslam.perf.accuracy.drives import (
-    LEAST_IMAGES,
+    MIN_IMAGES,
     SCALE_LIMIT,
     SEQUENCES,
     SPEED_LIMIT,
@@ -53,8 +53,8 @@ def run(arguments: list[str]) -> None:
     parser.add_argument("--images", type=int, default=25, help="of each start")
     parser.add_argument("--jobs", type=int, default=2, help="processes")
     options = parser.parse_args(arguments)
-    if min(options.every, options.jobs) < 1 or options.images < LEAST_IMAGES:
-        raise PerfError(f"--every and --jobs must be at least 1, --images at least {LEAST_IMAGES}")
+    if min(options.every, options.jobs) < 1 or options.images < MIN_IMAGES:
+        raise PerfError(f"--every and --jobs must be at least 1, --images at least {MIN_IMAGES}")
     configuration = networks_of(options)
     tasks = [
         Task(uri_of(sequence, options.data), name, mirrored, stride, options.every, options.images, configuration)
@@ -91,7 +91,7 @@ def measure(task: Task) -> tuple[str, list[dict[str, Any]]]:
     starts = []
     interpolated = truth_quality.interpolated(drive.poses)
     doubtful = truth_quality.doubtful(drive.poses, np.array(drive.t_ns, np.int64))
-    for first in range(0, count - LEAST_IMAGES + 1, task.every):
+    for first in range(0, count - MIN_IMAGES + 1, task.every):
         start = cold_start(drive, range(first, min(first + task.images, count)))
         if start is not None:
             # Counted among the wrong ones, and beside them: their truth is no measurement, or of no car

@@ -17,7 +17,7 @@ from birdslam.geometry.se2 import SE2
 from birdslam.loops.features import DESCRIPTOR_BYTES
 from birdslam.loops.gnss.earth import GnssFix
 from birdslam.loops.keyframe import Keyframe
-from birdslam.loops.keyframe_builder import MOST_POINTS, SPACING_M
+from birdslam.loops.keyframe_builder import MAX_POINTS, SPACING_M
 from birdslam.loops.localiser import Localisation
 from birdslam.loops.map_file import decode_map, encode_map
 from birdslam.loops.map_pose import MapState
@@ -190,14 +190,14 @@ def size(ledger: Ledger) -> None:
         place_map = PlaceMap(MapCamera.of(CAMERA))
         count = round(1000.0 * length_km / SPACING_M)
         for number in range(count):
-            flips = np.packbits(chance.random((MOST_POINTS, 8 * DESCRIPTOR_BYTES)) < 0.2, axis=1)
-            descriptors = common[chance.integers(0, len(common), MOST_POINTS)] ^ flips
-            points = chance.uniform(-20.0, 20.0, (MOST_POINTS, 3))
+            flips = np.packbits(chance.random((MAX_POINTS, 8 * DESCRIPTOR_BYTES)) < 0.2, axis=1)
+            descriptors = common[chance.integers(0, len(common), MAX_POINTS)] ^ flips
+            points = chance.uniform(-20.0, 20.0, (MAX_POINTS, 3))
             T = SE2(SPACING_M * number, 0.0, 0.0)
             place_map.add(
                 Keyframe(
                     *(number, 0, number, T, np.zeros((3, 3)), Attitude(), points),
-                    *(np.full(MOST_POINTS, 0.05), descriptors, CAMERA.height_m),
+                    *(np.full(MAX_POINTS, 0.05), descriptors, CAMERA.height_m),
                 )
             )
         begun = time.process_time()
@@ -207,7 +207,7 @@ def size(ledger: Ledger) -> None:
         took_ms, right = [], 0
         for number in range(0, count, max(1, count // LOOK_UPS)):
             own = place_map.keyframes[number].descriptors
-            seen = own ^ np.packbits(chance.random((MOST_POINTS, 8 * DESCRIPTOR_BYTES)) < SAME_BITS, axis=1)
+            seen = own ^ np.packbits(chance.random((MAX_POINTS, 8 * DESCRIPTOR_BYTES)) < SAME_BITS, axis=1)
             begun = time.process_time()
             found = index.look_up(seen, 6)
             took_ms.append(1e3 * (time.process_time() - begun))

@@ -29,7 +29,7 @@ KINDS = {"cars": ("Car",), "cars and vans": ("Car", "Van")}  # a van is a car to
 VEHICLES = ("car", "truck", "bus")
 RANGES_M = ((0.0, 15.0), (15.0, 30.0), (30.0, 50.0))
 SAME_IOU = 0.5
-MOST_OCCLUDED = 1  # KITTI: partly
+MAX_OCCLUDED = 1  # KITTI: partly
 OFF_DEG = 10.0  # a heading that is off by more
 PRIOR_M = (DIMENSIONS["car"].length_m, DIMENSIONS["car"].width_m, DIMENSIONS["car"].height_m)
 # A row of `errors`: depth (m), heading off by (rad), 1 where it is cut or hidden, logs of the size said over the true
@@ -98,7 +98,7 @@ def errors(
         alpha_rad = yaw_rad - math.atan2(-place_m[0], place_m[2])
         off_rad = math.remainder(float(bodies.alpha_rad[j]) - alpha_rad, 2.0 * math.pi)
         true_m = np.array([label.length_m, label.width_m, label.height_m])
-        cut = float(label.truncated > 0.0 or label.occluded > MOST_OCCLUDED)
+        cut = float(label.truncated > 0.0 or label.occluded > MAX_OCCLUDED)
         sizes = np.log(bodies.size_m[j] / true_m), np.log(PRIOR_M / true_m)
         out.append((label, np.hstack([place_m[2], off_rad, cut, *sizes])))
     return out

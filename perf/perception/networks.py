@@ -43,7 +43,7 @@ MIN_SCORE = 0.4  # of the other detector's boxes
 MIN_HEIGHT_PX = 30.0
 SAME_IOU = 0.5
 BORDER_PX = 4.0  # a box that comes so near to the image's side may be cut off
-NEAREST_M = 2.0  # LiDAR returns nearer than this are the car's own
+MIN_DISTANCE_M = 2.0  # LiDAR returns nearer than this are the car's own
 
 
 def run(arguments: list[str]) -> None:
@@ -165,7 +165,7 @@ def _beside_lidar(found: Findings, points_m: Floats, camera: Camera) -> Floats:
     """(N, 3) said depth, LiDAR depth, 1 on the predicted road, of the returns in the image."""
     assert found.depth is not None
     assert found.segmentation is not None
-    points_m = points_m[points_m[:, 2] > NEAREST_M]
+    points_m = points_m[points_m[:, 2] > MIN_DISTANCE_M]
     pixels = (points_m @ camera.K.T)[:, :2] / points_m[:, 2:]
     said_m = found.depth.in_metres(camera).at(pixels).astype(np.float64)
     inside = np.isfinite(said_m)

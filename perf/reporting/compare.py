@@ -23,7 +23,7 @@ from birdslam.perf.reporting.arguments import benchmark_parser
 label = "two reports: better, worse or not distinguishable"
 
 FALSE_DISCOVERIES = 0.01
-LEAST_SHIFT = 0.05  # of the old value; a smaller one is nobody's concern
+MIN_SHIFT = 0.05  # of the old value; a smaller one is nobody's concern
 Verdict = Literal["better", "worse", "not distinguishable"]
 
 
@@ -123,7 +123,7 @@ def _judge(name: str, old: list[float], new: list[float], p: float) -> Verdicts:
         a, b = (sum(side[::2]) / sum(side[1::2]) for side in (old, new))
     else:
         a, b = float(np.median(old)), float(np.median(new))
-    shifted = abs(b - a) > LEAST_SHIFT * abs(a)
+    shifted = abs(b - a) > MIN_SHIFT * abs(a)
     verdict: Verdict = "not distinguishable"
     if p < FALSE_DISCOVERIES and shifted:
         verdict = "worse" if abs(b) > abs(a) else "better"  # of everything that is measured here less is better

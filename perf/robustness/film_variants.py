@@ -19,7 +19,7 @@ from birdslam.world.windscreen import from_share
 Timed = tuple[int, Image]  # t_source_ns, the raw image
 Change = Callable[[int, Image], Image]  # of an image's index and the image
 
-LEAST_WIDTH_PX, MOST_WIDTH_PX = 320, 3840
+MIN_WIDTH_PX, MAX_WIDTH_PX = 320, 3840
 _ENCODER = "libx264"
 
 
@@ -53,7 +53,7 @@ class Variant:
 
     def fits(self, camera: Camera) -> bool:
         """Whether films have such a width."""
-        return LEAST_WIDTH_PX <= camera.width_px * self.size <= MOST_WIDTH_PX
+        return MIN_WIDTH_PX <= camera.width_px * self.size <= MAX_WIDTH_PX
 
     def images(self, film: Iterator[Timed], folder: Path) -> Iterator[Timed]:
         """The film's images so changed; `folder` takes what is encoded."""

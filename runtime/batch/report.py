@@ -24,10 +24,10 @@ from birdslam.outputs.report.page import REPORT, plotly_script, report_page
 from birdslam.runtime.batch.drive import DRIVES, RESULT, DriveResult, Failure, failure_file
 from birdslam.runtime.batch.drives import Task
 
-MOST_BARS = 40  # of a plot; more drives are drawn as a histogram
-MOST_STATUSES = 12
+MAX_BARS = 40  # of a plot; more drives are drawn as a histogram
+MAX_STATUSES = 12
 PLOTLY = "plotly.js"  # beside the report: the pages of all drives read it
-MOST_IN_A_CELL = 4  # statuses of one drive
+MAX_IN_A_CELL = 4  # statuses of one drive
 COLUMNS = (
     "drive", "source", "settings", "error", "frames", "duration_s", "path_m", "mean_speed_mps", "top_speed_mps",
     "vehicles", "invalid_frames", "epochs", "statuses", "ate_m", "ate_pct", "ate_se3_m", "ate_sim3_m", "scale_error",
@@ -141,7 +141,7 @@ def _plot(names: list[str], numbers: np.ndarray, statuses: Counter[str], path: P
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # here, since it takes half a second to import
     from matplotlib.figure import Figure
 
-    bars = len(names) <= MOST_BARS
+    bars = len(names) <= MAX_BARS
     row_in = 1.5 + 0.25 * max(len(names), 4) if bars else 4.0
     figure = Figure(figsize=(13.0, 3.0 * row_in), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
@@ -156,7 +156,7 @@ def _plot(names: list[str], numbers: np.ndarray, statuses: Counter[str], path: P
             plot.hist(values[known], bins=30, color="#3a7ca5")
             plot.set_ylabel("drives")
         plot.set_title(title)
-    common = statuses.most_common(MOST_STATUSES)
+    common = statuses.most_common(MAX_STATUSES)
     axes[-1].barh([name for name, _ in common], [count for _, count in common], color="#c0504d")
     axes[-1].invert_yaxis()
     axes[-1].set_title("frames with each status")
@@ -196,7 +196,7 @@ def _write_page(file: IO[str], tasks: Sequence[Task], output: Path) -> None:
         found = row(outcome)
         columns = ("frames", "duration_s", "path_m", "mean_speed_mps", "top_speed_mps", "vehicles", "invalid_frames")
         cells = [found[column] for column in (*columns, "ate_m", "ate_pct", "scale_error")]
-        most = sorted(outcome.statuses.items(), key=lambda one: -one[1])[:MOST_IN_A_CELL]
+        most = sorted(outcome.statuses.items(), key=lambda one: -one[1])[:MAX_IN_A_CELL]
         cells.append(", ".join(f"{name} {count}" for name, count in most))
         page = REPORT if (output / DRIVES / outcome.drive / REPORT).is_file() else "bev.png"
         link = f'<a href="{DRIVES}/{name}/{page}">{name}</a>'

@@ -31,8 +31,8 @@ from birdslam.runtime.transport.presence import ring_path, runtime_dir_of
 from birdslam.sources.recording import DatasetError
 
 Verdict = Literal["ok", "warning", "error"]
-LEAST_CORES = 4
-LEAST_MEMORY_GIB = 1.5
+MIN_CORES = 4
+MIN_MEMORY_GIB = 1.5
 _TIMEX_BYTES, _TIME_ERROR = 256, 5
 RING_MARGIN = 2.0  # /dev/shm holds a second ring while a restarted capture replaces its own
 
@@ -72,9 +72,9 @@ def _cores(configuration: Configuration) -> Iterator[Finding]:
     if beyond:
         text = ", ".join(f"{node}: {', '.join(map(str, sorted(cpus)))}" for node, cpus in beyond.items())
         yield Finding("cores", "warning", f"{found}; {text} can't be used", "correct realtime.NODE.cpus")
-    elif cores < LEAST_CORES - 0.5:
+    elif cores < MIN_CORES - 0.5:
         advice = (
-            f"33 frames a second want {LEAST_CORES} cores: choose smaller networks or a lower rate, or raise CPUQuota="
+            f"33 frames a second want {MIN_CORES} cores: choose smaller networks or a lower rate, or raise CPUQuota="
         )
         yield Finding("cores", "warning", found, advice)
     elif load > cores:
@@ -139,9 +139,9 @@ def _memory_lock(configuration: Configuration) -> Iterator[Finding]:
 def _memory(configuration: Configuration) -> Iterator[Finding]:
     lines = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text().splitlines())
     free_gib = int(lines["MemAvailable"].split()[0]) / 2**20
-    enough = free_gib >= LEAST_MEMORY_GIB
+    enough = free_gib >= MIN_MEMORY_GIB
     advice = (
-        "" if enough else f"the nodes and their spares want {LEAST_MEMORY_GIB:g} GiB: runtime.spares=false halves that"
+        "" if enough else f"the nodes and their spares want {MIN_MEMORY_GIB:g} GiB: runtime.spares=false halves that"
     )
     yield Finding("memory", "ok" if enough else "warning", f"{free_gib:.1f} GiB available", advice)
 

@@ -125,7 +125,7 @@ def run_sequence(job: Job, frame_made: Callable[[], object] = lambda: None) -> O
     with ExitStack() as stack:
         make = _log_maker(job, sequence, frames, stack, frame_made)
         static_map = slam.frontend.static_map
-        far = msgspec.structs.replace(static_map, landmark_range_m=ablation.FARTHEST_LANDMARK_M)
+        far = msgspec.structs.replace(static_map, landmark_range_m=ablation.MAX_LANDMARK_DISTANCE_M)
         for seed in range(job.seeds):
             far_log = make(seed, msgspec.structs.replace(slam.frontend, static_map=far))
             log = within(far_log, static_map.landmark_range_m)

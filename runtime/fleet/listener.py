@@ -27,7 +27,7 @@ from birdslam.runtime.transport.reply_parts import whole_map, whole_trajectory
 from birdslam.runtime.transport.session import close_session
 from birdslam.runtime.wire import Health, WireError, decode
 
-MOST_VEHICLES = 1_000  # of those that are not expected: what more says something is counted, not kept
+MAX_VEHICLES = 1_000  # of those that are not expected: what more says something is counted, not kept
 _SWEEPS = 4  # so often within max_age_ms it is looked who has fallen silent
 
 __all__ = ["Fleet", "FleetReading", "Received"]
@@ -70,7 +70,7 @@ class Fleet(Closing):
     def _slot_of(self, key: str) -> tuple[str, str, VehicleSlot] | None:
         """(vehicle, topic, slot) of a key, with the lock held; None where nothing is kept of it."""
         named = vehicle_and_topic(key)
-        if named is None or (named[0] not in self._slots and len(self._slots) >= MOST_VEHICLES):
+        if named is None or (named[0] not in self._slots and len(self._slots) >= MAX_VEHICLES):
             self.refused += 1
             if self.refused == 1:
                 log.warning("%.100s: nothing is kept of this, and of what is like it", key)

@@ -33,7 +33,7 @@ from birdslam.runtime.wire import Stage, Trace, WireError
 
 FORWARDED = ("estimate", *(f"health/{node}" for node in PROCESSES))
 _NODE = "uplink"
-_MOST_STAGES = 7  # of a trace that comes in, so that one more fits
+_MAX_STAGES = 7  # of a trace that comes in, so that one more fits
 _TRY_S = 2.0  # one attempt to reach the router
 
 
@@ -139,7 +139,7 @@ class Uplink(Closing):
 
 def _lengthened(trace: Trace, received_ns: int, done_ns: int) -> Trace:
     """With the uplink's own stage; what was left of the budget stays in it."""
-    stages = (*trace.stages[:_MOST_STAGES], Stage(_NODE, received_ns, done_ns))
+    stages = (*trace.stages[:_MAX_STAGES], Stage(_NODE, received_ns, done_ns))
     return msgspec.structs.replace(trace, stages=stages)
 
 

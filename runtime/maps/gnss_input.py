@@ -19,7 +19,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from birdslam.loops.gnss.earth import DEFAULT_SIGMA_M, GnssFix
-from birdslam.loops.gnss.files import GNSS_FILE, MOST_BYTES, MOST_FIXES, GnssError, checked_fix, read_fixes
+from birdslam.loops.gnss.files import GNSS_FILE, MAX_BYTES, MAX_FIXES, GnssError, checked_fix, read_fixes
 from birdslam.loops.gnss.sentences import NmeaReader, Sentence
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.schemes import ROS, all_schemes
@@ -29,7 +29,7 @@ from birdslam.sources.schemes import scheme_of
 
 TOPIC, BAG, NAV_SAT_FIX = "topic:", "rosbag", "sensor_msgs/NavSatFix"
 BAUD = 9600  # as NMEA 0183 receivers come
-MOST_LINE_BYTES = 512  # NMEA's own limit is 82
+MAX_LINE_BYTES = 512  # NMEA's own limit is 82
 REOPEN_S = 1.0
 
 log = logging.getLogger(__name__)
@@ -58,7 +58,7 @@ def recorded_fixes(configuration: Configuration) -> Fixes | None:
     path = Path(name).expanduser()
     try:
         with path.open("rb") as file:
-            data = file.read(MOST_BYTES + 1)
+            data = file.read(MAX_BYTES + 1)
     except OSError as error:
         raise GnssError(f"{path}: can't be read: {error.strerror}") from None
     read_fixes(data, str(path), 0)  # what is wrong with it is said before the drive
@@ -163,21 +163,21 @@ class Receiver:
                 log.warning("%s: the GNSS receiver is gone", self._path)
                 return False
             *lines, rest = (rest + data).split(b"\n")
-            rest = rest[-MOST_LINE_BYTES:]
+            rest = rest[-MAX_LINE_BYTES:]
             for line in lines:
                 arrived_ns = self._take_line(reader, line, arrived_ns, now_ns)
 
     def _take_line(self, reader: NmeaReader, line: bytes, arrived_ns: int, now_ns: int) -> int:
         begun = reader.waits
         try:
-            found = reader.take(line[:MOST_LINE_BYTES].decode("ascii", errors="replace"))
+            found = reader.take(line[:MAX_LINE_BYTES].decode("ascii", errors="replace"))
         except ValueError:
             self.refused += 1
             return arrived_ns
         if found is not None:
             with self._lock:
                 self._fixes.append((arrived_ns, found))
-                del self._fixes[:-MOST_FIXES]
+                del self._fixes[:-MAX_FIXES]
         return now_ns if reader.waits != begun else arrived_ns
 
     def take(self, offset_ns: int) -> list[GnssFix]:

@@ -13,7 +13,7 @@ from birdslam.outputs.placed import Place
 from birdslam.types import Estimate
 
 POSE_EVERY_M = 1.0  # of way: what is kept of a drive for its place on Earth
-MOST_POSES = 20_000  # of them; a longer drive keeps every second one, and so on
+MAX_POSES = 20_000  # of them; a longer drive keeps every second one, and so on
 HELD_M = 30.0  # a pose moves with the keyframe that is so near
 NONE = -1  # in place of a keyframe's number: there was none near, and the pose is in the map
 
@@ -26,8 +26,8 @@ class HeldWay:
     """
 
     def __init__(self) -> None:
-        self._numbers = np.full((MOST_POSES + 1, 3), NONE, np.int64)  # source time in ns, epoch, keyframe
-        self._poses = np.full((MOST_POSES + 1, 6), np.nan)  # T_odom_ego and T_keyframe_ego: x_m, y_m, yaw_rad
+        self._numbers = np.full((MAX_POSES + 1, 3), NONE, np.int64)  # source time in ns, epoch, keyframe
+        self._poses = np.full((MAX_POSES + 1, 6), np.nan)  # T_odom_ego and T_keyframe_ego: x_m, y_m, yaw_rad
         self._length = 0
         self._every_m = POSE_EVERY_M
         self._last: SE2 | None = None  # of them, in the map
@@ -45,7 +45,7 @@ class HeldWay:
         self._numbers[self._length] = estimate.t_source_ns, estimate.epoch, number
         self._poses[self._length] = *_of(estimate.T_world_ego), *_of(T_keyframe_ego)
         self._length += 1
-        if self._length > MOST_POSES:
+        if self._length > MAX_POSES:
             for kept in (self._numbers, self._poses):
                 half = kept[: self._length : 2]
                 kept[: len(half)] = half.copy()

@@ -6,7 +6,7 @@ import os
 import tempfile
 from pathlib import Path
 
-from birdslam.loops.map_file import MOST_BYTES, MapError, decode_map, encode_map
+from birdslam.loops.map_file import MAX_BYTES, MapError, decode_map, encode_map
 from birdslam.loops.place_map import PlaceMap
 
 
@@ -14,7 +14,7 @@ def read_map(path: Path) -> PlaceMap:
     """Raises MapError, which names the file and says what is wrong with it."""
     try:
         with path.open("rb") as file:
-            data = file.read(MOST_BYTES + 1)
+            data = file.read(MAX_BYTES + 1)
     except OSError as error:
         raise MapError(f"{path}: can't be read: {error.strerror}") from None
     try:

@@ -18,7 +18,7 @@ import numpy as np
 from birdslam.perception import ModelSpec, Network, load_network
 
 MEASURED_S = 1.0  # of all providers together
-LEAST_RUNS = 3
+MIN_RUNS = 3
 # Of each output the RMS difference to the CPU's, by its RMS. A network that is off by more is computed otherwise than
 # it was tested: OpenVINO rounds our network's 8 bits so that it is off by 7.5 %, and two in floats by less than .01 %
 TOLERANCE_REL = 0.02
@@ -93,7 +93,7 @@ def _off(found: np.ndarray, truth: np.ndarray) -> float:
 
 def _median_ms(network: Network, within_s: float) -> float:
     until_s, took_ms = time.monotonic() + within_s, list[float]()
-    while len(took_ms) < LEAST_RUNS or time.monotonic() < until_s:
+    while len(took_ms) < MIN_RUNS or time.monotonic() < until_s:
         begun_s = time.perf_counter()
         network.infer()
         took_ms.append((time.perf_counter() - begun_s) * 1e3)

@@ -17,7 +17,7 @@ import numpy as np
 from birdslam.runtime.configuration import Configuration
 from birdslam.runtime.transport.presence import runtime_dir_of
 
-MOST_BYTES = 1 << 20
+MAX_BYTES = 1 << 20
 _PLACES, _HEAD_BYTES = 2, 64
 _TURN, _FRAME, _EPOCH, _BYTES = range(4)  # words of a head; _TURN is 0 where there is nothing
 
@@ -44,20 +44,20 @@ class CheckpointFile:
     def __init__(self, path: Path) -> None:
         fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
         try:
-            size = _PLACES * (_HEAD_BYTES + MOST_BYTES)
+            size = _PLACES * (_HEAD_BYTES + MAX_BYTES)
             os.posix_fallocate(fd, 0, size)
             memory = mmap.mmap(fd, size)
         finally:
             os.close(fd)
-        places = np.frombuffer(memory, dtype=np.uint8).reshape(_PLACES, _HEAD_BYTES + MOST_BYTES)
+        places = np.frombuffer(memory, dtype=np.uint8).reshape(_PLACES, _HEAD_BYTES + MAX_BYTES)
         self._heads = [place[:_HEAD_BYTES].view(np.int64) for place in places]
         self._bodies = [place[_HEAD_BYTES:] for place in places]
         self._turn = max(int(head[_TURN]) for head in self._heads)
 
     def store(self, frame_id: int, epoch: int, data: bytes) -> bool:
         """One more, over the older of the two; False where it is too large."""
-        if len(data) > MOST_BYTES:
-            log.warning("a checkpoint of %d B is over %d B: a restart will begin a new epoch", len(data), MOST_BYTES)
+        if len(data) > MAX_BYTES:
+            log.warning("a checkpoint of %d B is over %d B: a restart will begin a new epoch", len(data), MAX_BYTES)
             return False
         self._turn += 1
         head, body = self._heads[self._turn % _PLACES], self._bodies[self._turn % _PLACES]
@@ -71,7 +71,7 @@ class CheckpointFile:
         """What there is, the newest first. They are removed: a checkpoint that crashes the optimizer does so once."""
         found = []
         for head, body in sorted(zip(self._heads, self._bodies, strict=True), key=lambda place: -int(place[0][_TURN])):
-            if head[_TURN] > 0 and 0 < head[_BYTES] <= MOST_BYTES:
+            if head[_TURN] > 0 and 0 < head[_BYTES] <= MAX_BYTES:
                 found.append(Checkpoint(int(head[_FRAME]), int(head[_EPOCH]), body[: int(head[_BYTES])].tobytes()))
             head[_TURN] = 0
         return found
@@ -79,7 +79,7 @@ class CheckpointFile:
 
 def newest_checkpoint(path: Path) -> Checkpoint | None:
     """The newest whole checkpoint in the file, as another process sees it; None where there is none now."""
-    size = _HEAD_BYTES + MOST_BYTES
+    size = _HEAD_BYTES + MAX_BYTES
     try:
         fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
     except FileNotFoundError:
@@ -87,7 +87,7 @@ def newest_checkpoint(path: Path) -> Checkpoint | None:
     try:
         heads = [(_head(fd, place * size), place) for place in range(_PLACES)]
         (turn, frame_id, epoch, length), place = max(heads, key=lambda found: found[0][_TURN])
-        if turn <= 0 or not 0 < length <= MOST_BYTES:
+        if turn <= 0 or not 0 < length <= MAX_BYTES:
             return None
         data = os.pread(fd, length, place * size + _HEAD_BYTES)
         whole = len(data) == length and _head(fd, place * size)[_TURN] == turn  # else the optimizer is writing there

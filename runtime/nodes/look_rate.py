@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from birdslam.geometry.camera import Camera
 from birdslam.runtime.configuration import LooksConfig
 
-LEAST_RUNS = 3  # of a network that is measured; its first is not counted
+MIN_RUNS = 3  # of a network that is measured; its first is not counted
 MASKS_SPARING = 2  # looks that are spared are for boxes; masks, which change more slowly, come with one in so many
 FRONT_END_CORES = 1.25  # what the frames themselves keep busy: one core in perceive, a part of another elsewhere
 
@@ -51,7 +51,7 @@ def measure(
     for name, run in runs.items():
         run(image)
         until_s, took_ms = time.monotonic() + within_s / len(runs), list[float]()
-        while len(took_ms) < LEAST_RUNS or time.monotonic() < until_s:
+        while len(took_ms) < MIN_RUNS or time.monotonic() < until_s:
             begun_s = time.perf_counter()
             run(image)
             took_ms.append((time.perf_counter() - begun_s) * 1e3)

@@ -33,7 +33,7 @@ _FIRST, _FIRST_NICE = ("capture", "optimize"), -5
 # cores beside a load of 11 a planner had an estimate p99 29 to 80 ms after it was sent; with this nice value 26 to 47,
 # with a short slice of this thread and of the planner's 7 and 14, the age at the planner p99 74 to 124 and 63, 86 ms
 _FRAMES, _FRAMES_CORES, _FRAMES_NICE = "perceive", 2.0, -20
-_LEAST_PERIOD_MS = 10.0  # of frames, for SCHED_FIFO: at more than 100 Hz they would leave no core to the others
+_MIN_PERIOD_MS = 10.0  # of frames, for SCHED_FIFO: at more than 100 Hz they would leave no core to the others
 _LOWER_NICE = 5  # nicer: a third of the time that one gets that wants the same core and is not
 _NICEST = 19
 
@@ -61,7 +61,7 @@ def apply(node: str, configuration: Configuration) -> Iterator[str]:
             yield f"realtime.{node}.cpus: can't run on cores {cpus} ({error.strerror}): runs on any"
     every = realtime.fifo == "on" or (realtime.fifo == "auto" and live)
     first = node in _FIRST and not configuration.lossless
-    seldom = (configuration.perceive.period_ms or 0.0) >= _LEAST_PERIOD_MS
+    seldom = (configuration.perceive.period_ms or 0.0) >= _MIN_PERIOD_MS
     by_fifo = (every or (first and seldom and realtime.fifo == "auto")) and _by_fifo(_threads(), scheduling.priority)
     frames = node == _FRAMES and not every and not configuration.lossless and usable_cores() >= _FRAMES_CORES
     if frames and seldom and realtime.fifo == "auto":

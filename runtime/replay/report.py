@@ -7,7 +7,7 @@ import importlib.metadata
 from birdslam.runtime.recording.recording import Recording
 from birdslam.runtime.replay.verdict import Verdict
 
-MOST_FIELDS = 12
+MAX_FIELDS = 12
 
 
 def report(verdict: Verdict, recording: Recording) -> str:
@@ -27,10 +27,10 @@ def report(verdict: Verdict, recording: Recording) -> str:
     difference = verdict.difference
     if difference is not None:
         lines.append(f"frame {difference.frame_id} DIFFERS, the first that does:")
-        shown = difference.fields[:MOST_FIELDS]
+        shown = difference.fields[:MAX_FIELDS]
         lines += [f"  {where}: recorded {recorded}, replayed {replayed}" for where, recorded, replayed in shown]
-        if len(difference.fields) > MOST_FIELDS:
-            lines.append(f"  and {len(difference.fields) - MOST_FIELDS} more")
+        if len(difference.fields) > MAX_FIELDS:
+            lines.append(f"  and {len(difference.fields) - MAX_FIELDS} more")
         for name, version in recording.about.versions.items():
             now = _version(name)
             if now is not None and now != version:

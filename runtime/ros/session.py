@@ -19,7 +19,7 @@ import zenoh.ext
 
 from birdslam.ros.message_types import MessageTypes
 from birdslam.ros.rmw_zenoh import (
-    MOST_DOMAIN,
+    MAX_DOMAIN,
     NO_HASH,
     Node,
     Qos,
@@ -36,7 +36,7 @@ from birdslam.runtime.transport.session import close_session, open_session
 SESSION_FILE = "ZENOH_SESSION_CONFIG_URI"
 DOMAIN = "ROS_DOMAIN_ID"
 ROUTER_S = 2.0  # one attempt to reach it
-_MOST_BYTES = 1 << 26  # of a message: an image of 5000x4000 px in colour; zenoh would put together 1 GiB
+_MAX_BYTES = 1 << 26  # of a message: an image of 5000x4000 px in colour; zenoh would put together 1 GiB
 _RETRY = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2}
 _HEARTBEAT_S = 0.5  # of what is latched, after a message: as rmw_zenoh
 _CDR = zenoh.Encoding("application/cdr")
@@ -47,8 +47,8 @@ def domain_of(config: RosConfig) -> int:
     if config.domain is not None:
         return config.domain
     text = os.environ.get(DOMAIN, "0")
-    if not text.isdecimal() or int(text) > MOST_DOMAIN:
-        raise ConfigurationError(f"{DOMAIN}={text!r}: needs a number from 0 to {MOST_DOMAIN}")
+    if not text.isdecimal() or int(text) > MAX_DOMAIN:
+        raise ConfigurationError(f"{DOMAIN}={text!r}: needs a number from 0 to {MAX_DOMAIN}")
     return int(text)
 
 
@@ -72,7 +72,7 @@ def session_config(router: str, timeout_s: float) -> zenoh.Config:
             "connect/retry": _RETRY,
             "scouting/multicast/enabled": False,
             "scouting/gossip/enabled": False,
-            "transport/link/rx/max_message_size": _MOST_BYTES,
+            "transport/link/rx/max_message_size": _MAX_BYTES,
             "transport/shared_memory/enabled": False,
             "adminspace/enabled": False,
             "timestamping/enabled": True,  # what is kept for those that come late needs it

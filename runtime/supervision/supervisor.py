@@ -29,7 +29,7 @@ START_ORDER = ("optimize", "perceive", "capture")  # each awaits the one before 
 BEFORE = {"perceive": "capture", "optimize": "perceive"}  # who sends to whom
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 CHECK_S = 0.1  # watchdogs are looked after at least so often
-MOST_WARNINGS = 5  # at a time; the log has all of them
+MAX_WARNINGS = 5  # at a time; the log has all of them
 
 
 class Supervisor:
@@ -206,10 +206,10 @@ class Supervisor:
     def _show(self) -> None:
         for station in self._stations:
             warnings = station.log.new_warnings()
-            for line in warnings[:MOST_WARNINGS]:
+            for line in warnings[:MAX_WARNINGS]:
                 self._live.say(f"{station.name}: {line}")
-            if len(warnings) > MOST_WARNINGS:
-                self._live.say(f"{station.name}: {len(warnings) - MOST_WARNINGS} more warnings in {station.log.path}")
+            if len(warnings) > MAX_WARNINGS:
+                self._live.say(f"{station.name}: {len(warnings) - MAX_WARNINGS} more warnings in {station.log.path}")
         if self._logbook.unwritten is not None and not self._disk_said:
             self._disk_said = True
             self._live.say(f"results are not written any more: {self._logbook.unwritten}")

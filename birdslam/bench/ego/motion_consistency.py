@@ -25,7 +25,7 @@ DIMENSIONS = 3
 MEDIAN = 2.366  # of the chi-square of three degrees of freedom: what a consistent error's squared distance is as often
 MEDIAN_LENGTH = 0.455  # the same of one degree of freedom
 STRETCH_M = 10.0
-LEAST_M = 0.05  # a shorter motion's length says nothing of the scale
+MIN_M = 0.05  # a shorter motion's length says nothing of the scale
 
 
 def _alone(measurements: Measurements) -> Measurements:
@@ -154,7 +154,7 @@ class Motions:
             if not interpolated[first + 1 : last + 1].any():
                 aside = moved_by_turn(T_first_last) * axes_rad
                 measured.append(float(error @ np.linalg.solve(cov + noise + np.outer(aside, aside), error)))
-                if (length_m := np.hypot(goal.x_m, goal.y_m)) > LEAST_M:
+                if (length_m := np.hypot(goal.x_m, goal.y_m)) > MIN_M:
                     lengths.append(nees_of_length(T_first_last, cov + noise, float(length_m)))
         return MotionConsistency(
             n=len(plain),

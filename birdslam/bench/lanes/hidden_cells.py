@@ -36,8 +36,8 @@ from birdslam.perception import Segmentation
 Grids = Floats32
 
 LATER_LOOKS = 75  # whose points are the truth: at 0.4 m from one to the next the ego has passed by then
-LEAST_LOOKED = 6.0  # points of later frames in a cell, for it to be known
-MOST_SHARE = 0.5  # of them on the road, for a cell of the road; of a line a quarter does: it is narrower than a cell
+MIN_LOOKED = 6.0  # points of later frames in a cell, for it to be known
+MAX_SHARE = 0.5  # of them on the road, for a cell of the road; of a line a quarter does: it is narrower than a cell
 LINE_SHARE = 0.25
 CLOSING_CELLS = 9  # of the morphological closing: 2 m
 METHODS = ("seen", "closing", "network")
@@ -127,9 +127,9 @@ class HiddenCells:
             )
             for c in range(3)
         )
-        known = looked >= LEAST_LOOKED
+        known = looked >= MIN_LOOKED
         share = np.stack([road + line, line]) / np.maximum(looked, 1.0)
-        least = np.array([MOST_SHARE, LINE_SHARE])[:, None, None]
+        least = np.array([MAX_SHARE, LINE_SHARE])[:, None, None]
         return (known & (share >= least)).astype(np.float32), known
 
     def report(self, drive: str) -> tuple[HiddenReport, Recovered | None]:

@@ -26,7 +26,7 @@ from birdslam.types import Bound, LaneLine
 
 # KITTI's camera 2 of 2011_09_26, rectified
 FOCAL_PX, CENTRE_PX, HEIGHT_M = 721.5377, (609.5593, 172.854), 1.65
-FARTHEST_M = 30.0  # of the comparison
+MAX_DISTANCE_M = 30.0  # of the comparison
 HALF_WIDTH_M, CELL_M = 10.0, 0.05  # of its grid
 LANE, IGNORED = (255, 0, 255), (0, 0, 0)  # BGR
 
@@ -155,8 +155,8 @@ def score(name: str, camera: Camera, still: Still, mask: NDArray[np.uint8]) -> S
 
 
 def grid_px(camera: Camera) -> tuple[Ints, Ints]:
-    """Rows and columns of the pixels that a grid on the road falls on, to FARTHEST_M, by the camera's own ground."""
-    x_m = np.arange(1.0, FARTHEST_M, CELL_M)
+    """Returns rows and columns of the pixels of a road grid up to MAX_DISTANCE_M, by the ground of the camera."""
+    x_m = np.arange(1.0, MAX_DISTANCE_M, CELL_M)
     y_m = np.arange(-HALF_WIDTH_M, HALF_WIDTH_M, CELL_M)
     grid = np.stack(np.meshgrid(x_m, y_m, indexing="ij"), axis=-1).reshape(-1, 2)
     px = bev.ego_to_pixel(camera, camera.ground, grid)

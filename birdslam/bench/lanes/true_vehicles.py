@@ -19,7 +19,7 @@ from birdslam.types import Estimate, VehicleLane
 ALONG_M, ALONG_REL = 2.0, 0.15
 ACROSS_M, ACROSS_REL = 1.0, 0.02
 PEOPLE = ("pedestrian", "cyclist")  # bodies that are no vehicle's
-LEAST_PROBABILITY = 1e-3  # a certain error counts as so much in the log loss
+MIN_PROBABILITY = 1e-3  # a certain error counts as so much in the log loss
 AGAINST_RAD = math.pi / 2
 DASHED = "dashed"  # of a true line's kinds
 # Wide enough a strip beside a lane for cars to park in it; lanes of one road differ by a few decimetres
@@ -69,7 +69,7 @@ class VehicleScores:
     def _add_place(self, place: VehicleLane, where: str) -> None:
         shares = {name: getattr(place, name) for name in PLACES}
         self._right.append(max(shares, key=lambda name: shares[name]) == where)
-        self._losses.append(-math.log(max(shares[where], LEAST_PROBABILITY)))
+        self._losses.append(-math.log(max(shares[where], MIN_PROBABILITY)))
 
     def _add_leader(
         self, estimate: Estimate, body_of: dict[int, TrueBody], bodies: Sequence[TrueBody], truth: tuple[TrueLine, ...]

@@ -24,7 +24,7 @@ from birdslam.types import NS_PER_S, Attitude, Estimate
 CAMERA = Camera(width_px=1242, height_px=375, fx_px=720.0, fy_px=720.0, cx_px=621.0, cy_px=180.0, height_m=1.65)
 CORNERS_PER_M = 4.0
 SIGHT_M = 60.0
-MOST_SEEN = 220
+MAX_SEEN = 220
 NOISE_PX = 0.5
 SAME_BITS, OTHER_LIGHT_BITS = 0.06, 0.14  # of a descriptor, that differ when a corner is seen again
 SCALE_DRIFT, YAW_DRIFT_RAD = 0.01, 0.0008  # of the simulated odometry, by the root of a metre; scale: of a whole drive
@@ -51,7 +51,7 @@ class Street:
         px = CAMERA.to_px(p[:, :2] / p[:, 2:])
         inside = ((px > 0.0) & (px < (CAMERA.width_px, CAMERA.height_px))).all(axis=1)
         near, px = near[inside], px[inside]
-        seen = np.sort(chance.permutation(len(near))[:MOST_SEEN])
+        seen = np.sort(chance.permutation(len(near))[:MAX_SEEN])
         near, px = near[seen], px[seen] + NOISE_PX * chance.standard_normal((len(seen), 2))
         flips = np.packbits(chance.random((len(near), 8 * DESCRIPTOR_BYTES)) < bits, axis=1)
         return Features(px, np.full(len(px), NOISE_PX), self.descriptors[near] ^ flips)

@@ -28,7 +28,7 @@ CP_WEIGHTS = MappingProxyType({"cp_low": 0.01, "cp_medium": 1.0, "cp_high": 100.
 DEPTHS_M = MappingProxyType(
     {"depth_12": 12.0, "depth_15": 15.0, "depth_18": 18.0, "depth_20": 20.0, "depth_none": None}
 )
-FARTHEST_LANDMARK_M = 200.0  # beyond any threshold, so that the front end's own limit does not hide it
+MAX_LANDMARK_DISTANCE_M = 200.0  # beyond any threshold, so that the front end's own limit does not hide it
 
 
 def constraint_variants(base: Live) -> dict[str, Live]:

@@ -39,7 +39,7 @@ from birdslam.vehicles.rts_smoother import RtsSmoother, SmootherConfig
 
 EGO = "ego"
 SEEN_EXACTLY = "seen_exactly"  # instead of a method's name: its errors, had the live ego seen every vehicle exactly
-LEAST_FRAMES = 5  # a vehicle matched in fewer is left out of the report, unless the paper names it
+MIN_FRAMES = 5  # a vehicle matched in fewer is left out of the report, unless the paper names it
 
 NO_IMAGE = np.zeros((1, 1), dtype=np.uint8)  # for an odometry that needs none
 
@@ -305,7 +305,7 @@ def summarise(sequence: str, trials: Sequence[Trial], keep: Iterable[str], odome
             found = [trial.errors[method].get(body) for trial in trials]
             seen = [errors for errors in found if errors is not None]
             frames = float(np.median([0 if errors is None else errors.frames for errors in found]))
-            if frames < LEAST_FRAMES and body not in keep:
+            if frames < MIN_FRAMES and body not in keep:
                 continue
             is_ego = body == EGO
             rows.append(

@@ -17,8 +17,8 @@ from birdslam.sources.kitti_tracking import VEHICLE_KINDS, TrackingSequence
 from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
 
 HALF_SPAN = 3  # frames before and after, whose labels count too: a camera pitches within half a second
-NEAREST_M, FARTHEST_M = 5.0, 60.0  # of labels that are used
-LEAST_VEHICLES = 2  # a tilt by fewer is not held to another's
+MIN_DISTANCE_M, MAX_DISTANCE_M = 5.0, 60.0  # of labels that are used
+MIN_VEHICLES = 2  # a tilt by fewer is not held to another's
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ def labelled_grounds(sequence: TrackingSequence) -> list[LabelledGround | None]:
     found: dict[int, list[tuple[int, float, float, float]]] = {}
     for label in sequence.labels:
         x, y, z = label.place_m
-        if label.kind in VEHICLE_KINDS and label.truncated <= 0 and NEAREST_M < z < FARTHEST_M:
+        if label.kind in VEHICLE_KINDS and label.truncated <= 0 and MIN_DISTANCE_M < z < MAX_DISTANCE_M:
             slope = (y - sequence.camera.height_m) / z
             found.setdefault(label.frame, []).append((label.track, z, -x / z, slope))
     out: list[LabelledGround | None] = []

@@ -13,7 +13,7 @@ from typing import Protocol
 import msgspec
 import numpy as np
 
-from birdslam.bench.tracking.localisation import MOST
+from birdslam.bench.tracking.localisation import MAX_SQUARED_DISTANCE
 from birdslam.geometry.arrays import Floats
 
 
@@ -45,7 +45,7 @@ class LeftOut(msgspec.Struct, frozen=True, kw_only=True):
 
 def score(errors: Sequence[PlaceError]) -> float:
     """Mean negative log likelihood of places (m), less its constant; smaller is better."""
-    distances = np.minimum([e.mahalanobis2 for e in errors], MOST)
+    distances = np.minimum([e.mahalanobis2 for e in errors], MAX_SQUARED_DISTANCE)
     return float(np.mean(0.5 * distances + 0.5 * np.array([e.log_det_cov for e in errors])))
 
 

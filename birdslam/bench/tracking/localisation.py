@@ -20,7 +20,7 @@ from scipy.stats import chi2
 from birdslam.bench.simulation.odometry import EXACT, OdometryNoise, SimulatedOdometry
 from birdslam.bench.simulation.tilt_from_images import TiltFromImages
 from birdslam.bench.tracking.benchmark import make_log
-from birdslam.bench.tracking.labelled_road import LEAST_VEHICLES, labelled_grounds
+from birdslam.bench.tracking.labelled_road import MIN_VEHICLES, labelled_grounds
 from birdslam.bench.tracking.metrics import match_vehicles
 from birdslam.frontend import EgoMotion, FrontEndConfig
 from birdslam.geometry.arrays import Floats
@@ -35,7 +35,7 @@ CAMERA_OF_BOXES = 2  # labels and RRC detections were drawn in its images
 RANGES_M = ((0.0, 15.0), (15.0, 30.0), (30.0, 50.0))
 INSIDE_1_SIGMA, INSIDE_2_SIGMA = (float(chi2.ppf(chi2.cdf(k**2, 1), 2)) for k in (1, 2))  # 2.30, 6.18
 MEASURED_KIND = "Car"
-MOST = 25.0  # squared Mahalanobis distance of a car, at the most: five sigma
+MAX_SQUARED_DISTANCE = 25.0  # squared Mahalanobis distance of a car, at the most: five sigma
 STANDS_MPS = 1.0  # an ego that is slower stands or nearly
 TALL_M = 1.75  # of a label: taller than nearly all cars
 CHOSE_NOTHING = ("0012", "0013", "0014", "0016", "0017")  # of places; docs/constants.md has the few priors by labels
@@ -174,7 +174,7 @@ def tilt_row(sequence: TrackingSequence, measurements: Iterable[Measurements]) -
     labelled, errors = labelled_grounds(sequence), []
     for record in measurements:
         truth = labelled[record.frame_id]
-        if truth is not None and truth.vehicles >= LEAST_VEHICLES and record.ground is not None:
+        if truth is not None and truth.vehicles >= MIN_VEHICLES and record.ground is not None:
             of_roll = abs(record.ground.roll_rad - truth.ground.roll_rad)
             errors.append((abs(record.ground.pitch_rad - truth.ground.pitch_rad), of_roll))
     if not errors:
@@ -276,7 +276,7 @@ def _row(sequence: str, span: str, errors: Sequence[CarError]) -> LocalisationRo
         depth_bias_median_rel=float(np.median(along / depth_m)),
         yaw_error_median_deg=math.degrees(float(np.median(turned))),
         cars=len(sights),
-        nees=float(np.mean(np.minimum(spread, MOST))) / 2.0,
+        nees=float(np.mean(np.minimum(spread, MAX_SQUARED_DISTANCE))) / 2.0,
         yaw_off_10_deg=float(np.mean(turned > math.radians(10.0))),
         inside_1_sigma_by_car=float(np.average(spread <= INSIDE_1_SIGMA, weights=once)),
         inside_2_sigma_by_car=float(np.average(spread <= INSIDE_2_SIGMA, weights=once)),

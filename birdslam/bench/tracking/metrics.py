@@ -23,7 +23,7 @@ from birdslam.vehicles.placement.localisation import iou
 
 MATCH_IOU = 0.5
 HOTA_IOU = np.arange(0.05, 0.99, 0.05)
-LEAST_HEIGHT_PX = 25.0  # KITTI: lower boxes are no false alarms
+MIN_HEIGHT_PX = 25.0  # KITTI: lower boxes are no false alarms
 COUNTED_KIND = "Car"
 
 
@@ -80,7 +80,7 @@ def count_boxes(labels: Sequence[Label], tracks: Sequence[int], boxes_px: Floats
         if j in matched:
             keep.append(bool(asked[matched[j]]))
         else:
-            keep.append(box[3] - box[1] > LEAST_HEIGHT_PX and not mostly_inside(box, regions))
+            keep.append(box[3] - box[1] > MIN_HEIGHT_PX and not mostly_inside(box, regions))
     ids = np.array(tracks, dtype=np.int64).reshape(-1)
     names = np.array([label.track for label in vehicles], dtype=np.int64).reshape(-1)
     kept = np.array(keep, dtype=np.bool_)

@@ -19,7 +19,7 @@ from birdslam.sources.kitti import KITTI_RATE_HZ
 from birdslam.sources.kitti_tracking import VEHICLE_KINDS, TrackingSequence
 from birdslam.types import Estimate, Measurements, Moves, VehicleEstimate
 
-LEAST_SIGHTS = 5  # of a known speed: a track of fewer is not judged
+MIN_SIGHTS = 5  # of a known speed: a track of fewer is not judged
 SOON_S = 1.0
 
 Sight = tuple[int, float, VehicleEstimate]  # frame, true speed over the ground in m/s, and what was estimated
@@ -64,9 +64,9 @@ def movers_row(
             if (label, record.frame_id) in speeds:
                 seen = record.frame_id, speeds[label, record.frame_id], by_id[vehicle]
                 sights[vehicle, label].append(seen)
-    standing = {key: seen for key, seen in sights.items() if len(seen) >= LEAST_SIGHTS and stands(seen)}
+    standing = {key: seen for key, seen in sights.items() if len(seen) >= MIN_SIGHTS and stands(seen)}
     found = [_false_mover(sequence, *key, seen) for key, seen in standing.items()]
-    delays = [delay_s(seen, KITTI_RATE_HZ) for seen in sights.values() if len(seen) >= LEAST_SIGHTS]
+    delays = [delay_s(seen, KITTI_RATE_HZ) for seen in sights.values() if len(seen) >= MIN_SIGHTS]
     driving = [delay for delay in delays if delay is not None]
     return MoversRow(
         sequence=sequence.name,

@@ -12,7 +12,7 @@ from birdslam.bench.tracking.benchmark import Truth
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 
-LEAST_FRAMES = 10  # vehicles matched in fewer are left out
+MIN_FRAMES = 10  # vehicles matched in fewer are left out
 INK, TRUTH_ALPHA = "#20242c", 0.35
 
 
@@ -27,7 +27,7 @@ def draw_sequence(title: str, truth: Truth, result: Trajectories, path: Path) ->
     axes = figure.add_subplot()
     for k, (label, poses) in enumerate(sorted(truth.vehicles.items())):
         found = truth.found(label, result)
-        if len(found) >= LEAST_FRAMES:
+        if len(found) >= MIN_FRAMES:
             colour = f"C{k % 10}"
             at = _forward_up(poses)
             axes.plot(*at.T, color=colour, linewidth=5.0, alpha=TRUTH_ALPHA, solid_capstyle="round")

@@ -18,14 +18,14 @@ import numpy as np
 
 from birdslam.bench.figures import median
 from birdslam.bench.tracking.localisation import MEASURED_KIND, RANGES_M
-from birdslam.bench.tracking.metrics import LEAST_HEIGHT_PX, least_cost
+from birdslam.bench.tracking.metrics import MIN_HEIGHT_PX, least_cost
 from birdslam.sources.kitti import KITTI_RATE_HZ
 from birdslam.sources.kitti_tracking import TrackingSequence
 from birdslam.sources.label_projection import Label
 from birdslam.types import Estimate, VehicleEstimate
 
 FOUND_AHEAD_REL, FOUND_ACROSS_M = 0.2, 1.5
-MOST_OCCLUDED = 1  # KITTI: partly
+MAX_OCCLUDED = 1  # KITTI: partly
 HALF_SPAN = 5  # frames before and after, over which a label's speed is taken
 STANDS_MPS, DRIVES_MPS = 0.5, 2.0  # by its labels; between them neither is asked for
 REPORTED_DRIVING_MPS = 1.5  # of an estimate, as in the pictures
@@ -92,8 +92,8 @@ def sights(sequence: TrackingSequence, estimates: Sequence[Estimate]) -> list[Si
 
 def is_asked_for(label: Label) -> bool:
     """Whether a car is high enough in the image, whole and open to view."""
-    high = label.box_px[3] - label.box_px[1] >= LEAST_HEIGHT_PX
-    return label.kind == MEASURED_KIND and high and label.occluded <= MOST_OCCLUDED and label.truncated <= 0
+    high = label.box_px[3] - label.box_px[1] >= MIN_HEIGHT_PX
+    return label.kind == MEASURED_KIND and high and label.occluded <= MAX_OCCLUDED and label.truncated <= 0
 
 
 def _sight(

@@ -15,7 +15,7 @@ import numpy as np
 from birdslam.bench.ego.trajectory_errors import compare, from_first
 from birdslam.bench.figures import median
 from birdslam.bench.tracking.metrics import least_cost, path_errors
-from birdslam.bench.tracking.movers import LEAST_SIGHTS, SOON_S, Sight, delay_s, is_reported_driving, stands
+from birdslam.bench.tracking.movers import MIN_SIGHTS, SOON_S, Sight, delay_s, is_reported_driving, stands
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.se2 import SE2
@@ -27,8 +27,8 @@ from birdslam.types import Estimate, VehicleEstimate
 VEHICLES = ("car", "van", "truck", "bus")
 ASKED_VISIBLE, ASKED_TRUNCATED, ASKED_RANGE_M = 0.5, 0.2, (4.0, 40.0)  # bodies that are to be found
 GATE_M, GATE_REL = 2.0, 0.2  # a vehicle further from a body than the greater of the two (of its range) is another's
-LEAST_VISIBLE, MOST_LOG_RANGE = 0.15, 0.6  # of what a mover is judged by: part in view, and 1.8 times as far off
-LEAST_FRAMES = 10  # a body matched in fewer is not counted as a vehicle
+MIN_VISIBLE, MAX_LOG_RANGE = 0.15, 0.6  # of what a mover is judged by: part in view, and 1.8 times as far off
+MIN_FRAMES = 10  # a body matched in fewer is not counted as a vehicle
 
 
 class DemoGrade(msgspec.Struct, frozen=True, kw_only=True):
@@ -39,7 +39,7 @@ class DemoGrade(msgspec.Struct, frozen=True, kw_only=True):
     ego_ate_m: float  # root mean square of the positions' errors in 3-D, first pose aligned, no scale
     ego_ate_pct: float | None  # of path_m; None where the ego stood
     ego_scale_error: float | None
-    vehicles: int  # matched in LEAST_FRAMES and more
+    vehicles: int  # matched in MIN_FRAMES and more
     vehicle_ate_m: float | None  # in the global frame, nothing aligned: the median over the vehicles
     vehicle_centre_m: float | None  # median distance from the true centre, both as seen from the ego
     vehicle_centre_rel: float | None  # the same over the body's range
@@ -118,7 +118,7 @@ def grade(recording: DemoRecording, estimates: Sequence[Estimate]) -> DemoGrade:
     ates = [
         errors_of.ate_m
         for body, path in paths.items()
-        if len(path) >= LEAST_FRAMES and (errors_of := path_errors(true_paths[body], path)) is not None
+        if len(path) >= MIN_FRAMES and (errors_of := path_errors(true_paths[body], path)) is not None
     ]
     distance, reach = np.array(errors).reshape(-1, 2).T
     return DemoGrade(
@@ -139,7 +139,7 @@ def grade(recording: DemoRecording, estimates: Sequence[Estimate]) -> DemoGrade:
 
 def _movers(tracks: Sequence[Sequence[Sight]], rate_hz: float) -> dict[str, int]:
     """The fields of a grade that count tracks."""
-    long_enough = [seen for seen in tracks if len(seen) >= LEAST_SIGHTS / KITTI_RATE_HZ * rate_hz]
+    long_enough = [seen for seen in tracks if len(seen) >= MIN_SIGHTS / KITTI_RATE_HZ * rate_hz]
     standing = [seen for seen in long_enough if stands(seen)]
     delays = [delay for seen in long_enough if (delay := delay_s(seen, rate_hz)) is not None]
     return {
@@ -180,7 +180,7 @@ def match_by_bearing(estimate: Estimate, bodies: Sequence[TrueBody]) -> list[tup
     What is reported to drive falsely often stands at a wrong range.
     """
     seen = [vehicle for vehicle in estimate.vehicles if vehicle.age_ns == 0]
-    open_to_view = [body for body in bodies if body.visible >= LEAST_VISIBLE and body.T_ego_body.x_m > 0.0]
+    open_to_view = [body for body in bodies if body.visible >= MIN_VISIBLE and body.T_ego_body.x_m > 0.0]
     if not seen or not open_to_view:
         return []
     at = [estimate.T_world_ego.between(vehicle.T_world_vehicle) for vehicle in seen]
@@ -189,7 +189,7 @@ def match_by_bearing(estimate: Estimate, bodies: Sequence[TrueBody]) -> list[tup
     true_bearing, true_range_m = (np.array([of(p.y_m, p.x_m) for p in goal]) for of in (math.atan2, math.hypot))
     half_rad = np.array([0.5 * body.width_m for body in open_to_view]) / np.maximum(true_range_m, 1.0)
     aside = np.abs(true_bearing[:, None] - bearing) / half_rad[:, None]
-    along = np.abs(np.log(np.maximum(range_m, 1.0) / np.maximum(true_range_m, 1.0)[:, None])) / MOST_LOG_RANGE
+    along = np.abs(np.log(np.maximum(range_m, 1.0) / np.maximum(true_range_m, 1.0)[:, None])) / MAX_LOG_RANGE
     off = np.maximum(aside, along)
     rows, columns = least_cost(np.minimum(off, 1.0))
     return [(open_to_view[i], seen[j]) for i, j in zip(rows, columns, strict=True) if off[i, j] < 1.0]

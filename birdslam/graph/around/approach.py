@@ -15,7 +15,7 @@ from birdslam.types import Approach
 HORIZON_S = 30.0  # a later approach is reported as it would be then
 NEARBY_S, NEARBY_M, NEARBY_SIGMA = 5.0, 2.0, 2.0
 SLOWEST_MPS2 = 0.01  # a squared velocity below it is none
-MOST = 1e9  # of any number that is reported
+MAX_REPORTED = 1e9  # of any number that is reported
 
 
 def approaches(p: Complexes, v: Complexes, covs: Floats) -> list[Approach]:
@@ -42,7 +42,7 @@ def approaches(p: Complexes, v: Complexes, covs: Floats) -> list[Approach]:
     variances = np.einsum("qni,nij,qnj->qn", J, covs, J)
     np.sqrt(np.maximum(variances, 0.0), out=numbers[1::2])
     sigma_s *= free == time
-    np.minimum(numbers, MOST, out=numbers)
+    np.minimum(numbers, MAX_REPORTED, out=numbers)
     soon = (time <= NEARBY_S) & (distance - NEARBY_SIGMA * sigma_m <= NEARBY_M)
     return [
         Approach(time_s=t, sigma_s=s, distance_m=d, sigma_m=e, nearby=near)

@@ -14,10 +14,10 @@ from operator import itemgetter
 from birdslam.geometry.se2 import SE2
 from birdslam.types import HiddenFan, RoadUser
 
-FARTHEST_M = 40.0  # a fan ends there
-NEAREST_M = 1.0  # a vehicle that begins nearer stands beside the camera
+MAX_DISTANCE_M = 40.0  # a fan ends there
+MIN_DISTANCE_M = 1.0  # a vehicle that begins nearer stands beside the camera
 USUAL_HEIGHT_M = 1.5  # of a vehicle of unknown height
-LEAST_M = 0.3  # a fan that is shorter hides nobody
+MIN_M = 0.3  # a fan that is shorter hides nobody
 
 
 def hidden_fans(vehicles: Sequence[RoadUser], world: SE2, camera_m: float) -> tuple[HiddenFan, ...]:
@@ -28,20 +28,23 @@ def hidden_fans(vehicles: Sequence[RoadUser], world: SE2, camera_m: float) -> tu
         T = vehicle.T_world_vehicle
         at = (complex(T.x_m, T.y_m) - origin) * back
         away_m = abs(at)
-        if at.real <= NEAREST_M or away_m > FARTHEST_M or not vehicle.in_sight:
+        if at.real <= MIN_DISTANCE_M or away_m > MAX_DISTANCE_M or not vehicle.in_sight:
             continue
         ahead = cmath.rect(0.5 * vehicle.length_m, T.yaw_rad - world.yaw_rad)
-        left = 1j * ahead * (vehicle.width_m / max(vehicle.length_m, LEAST_M))
+        left = 1j * ahead * (vehicle.width_m / max(vehicle.length_m, MIN_M))
         corners = (at + ahead + left, at - ahead + left, at - ahead - left, at + ahead - left)
-        if min(corners[0].real, corners[1].real, corners[2].real, corners[3].real) <= NEAREST_M:
+        if min(corners[0].real, corners[1].real, corners[2].real, corners[3].real) <= MIN_DISTANCE_M:
             continue
         slopes = [c.imag / c.real for c in corners]  # in the order of the angles, since all lie ahead
         right, left = corners[slopes.index(min(slopes))], corners[slopes.index(max(slopes))]  # its outline
         right_m, left_m = abs(right), abs(left)
         over_m = camera_m - (vehicle.height_m or USUAL_HEIGHT_M)
         reach = camera_m / over_m if over_m > 0.0 else math.inf
-        beyond_right, beyond_left = right * min(reach, FARTHEST_M / right_m), left * min(reach, FARTHEST_M / left_m)
-        if abs(beyond_right) > right_m + LEAST_M and abs(beyond_left) > left_m + LEAST_M:
+        beyond_right, beyond_left = (
+            right * min(reach, MAX_DISTANCE_M / right_m),
+            left * min(reach, MAX_DISTANCE_M / left_m),
+        )
+        if abs(beyond_right) > right_m + MIN_M and abs(beyond_left) > left_m + MIN_M:
             x_m = right.real, beyond_right.real, beyond_left.real, left.real
             y_m = right.imag, beyond_right.imag, beyond_left.imag, left.imag
             fans.append((away_m, HiddenFan(vehicle=vehicle.vehicle, x_m=x_m, y_m=y_m)))

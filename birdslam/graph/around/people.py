@@ -19,12 +19,12 @@ from birdslam.geometry.se2 import SE2
 from birdslam.graph.around.approach import approaches
 from birdslam.types import FollowedPerson, RoadUser
 
-MOST = 60  # the nearest; a message and a frame's time have their limits
+MAX_PEOPLE = 60  # the nearest; a message and a frame's time have their limits
 YAW_UNKNOWN = math.pi**2 / 3.0  # the variance of a direction of which nothing is known
 CHANGE_MPS = 0.8  # 1-sigma by which a velocity changes within a second, as in `people_config.Sizes`
 TURNS_MPS = 0.5  # who moves slower has no yaw
-FARTHEST_M, FASTEST_MPS = 1e4, 1e3  # somebody beyond is no person, but numbers that no front end made
-_LIMITS = np.repeat([FARTHEST_M, FASTEST_MPS, FARTHEST_M**2, FASTEST_MPS**2], [2, 2, 4, 4])
+MAX_DISTANCE_M, FASTEST_MPS = 1e4, 1e3  # somebody beyond is no person, but numbers that no front end made
+_LIMITS = np.repeat([MAX_DISTANCE_M, FASTEST_MPS, MAX_DISTANCE_M**2, FASTEST_MPS**2], [2, 2, 4, 4])
 
 
 def people_estimates(
@@ -39,9 +39,9 @@ def people_estimates(
     parts = [part for f in people for part in ((f.x_m, f.y_m, f.vx_mps, f.vy_mps), f.cov, f.velocity_cov)]
     table = np.fromiter(chain.from_iterable(parts), np.float64, 12 * len(people)).reshape(-1, 12)
     sane = (np.abs(table) < _LIMITS).all(axis=1)
-    if len(people) > MOST or not sane.all():
+    if len(people) > MAX_PEOPLE or not sane.all():
         away_m = np.hypot(table[:, 0], table[:, 1])
-        nearest = sorted(np.flatnonzero(sane).tolist(), key=lambda k: (away_m[k], people[k].person))[:MOST]
+        nearest = sorted(np.flatnonzero(sane).tolist(), key=lambda k: (away_m[k], people[k].person))[:MAX_PEOPLE]
         kept = sorted(nearest, key=lambda k: people[k].person)
         people, table = [people[k] for k in kept], table[kept]
     p, v = np.ascontiguousarray(table[:, :4]).view(np.complex128).T

@@ -28,7 +28,7 @@ _NOTHING = 0.0, 0.0, 0.0, 0.0  # of a landmark that shares no error
 # What a frame's landmarks share lasts: correlated with itself by .42, .49, .34 from one key frame to the next and by
 # .40, .17, .21 to the one after (0005, 0002, 00): in a sum over key frames its variance counts 1 + 2 (r1 + r2) times
 SHARED_LASTS = 2.3
-_LEAST_VARIANCE_M2 = 1e-12  # a landmark without noise must not make the sum singular
+_MIN_VARIANCE_M2 = 1e-12  # a landmark without noise must not make the sum singular
 
 
 @dataclass(slots=True)
@@ -64,7 +64,7 @@ def sightings(edges: tuple[LandmarkEdge, ...]) -> Sightings:
         keys, table = [key for key, keep in zip(keys, sane.tolist(), strict=True) if keep], table[sane]
     x, y, xx, xy, _, yy = table.T[:6]
     shared = table.T[6:8] + 1j * table.T[8:]
-    out = Sightings(keys, x + 1j * y, 0.5 * (xx + yy) + _LEAST_VARIANCE_M2, 0.5 * (xx - yy) + 1j * xy, shared)
+    out = Sightings(keys, x + 1j * y, 0.5 * (xx + yy) + _MIN_VARIANCE_M2, 0.5 * (xx - yy) + 1j * xy, shared)
     good = out.means - 0.5 * (shared * shared.conj()).real.sum(axis=0) > np.abs(
         out.deviators - 0.5 * (shared * shared).sum(axis=0)
     )

@@ -14,7 +14,7 @@ from birdslam.geometry.arrays import Complexes, Floats
 from birdslam.graph.edges import CvEdges
 
 DRIVING_MPS = 1.0  # as in vehicles/state/ground_size_config.py: the view changes far above this speed, not below it
-_LEAST_M2 = 1e-12
+_MIN_M2 = 1e-12
 
 
 def sight_factors(at: Complexes, covs: Floats) -> Floats:
@@ -23,9 +23,9 @@ def sight_factors(at: Complexes, covs: Floats) -> Floats:
     axes = np.array([[along.real, -along.imag], [along.imag, along.real]]).transpose(2, 0, 1)
     C = axes.transpose(0, 2, 1) @ covs[:, :2, :2] @ axes
     L = np.zeros(C.shape)  # Cholesky's, of what may be singular
-    L[:, 0, 0] = np.sqrt(np.maximum(C[:, 0, 0], _LEAST_M2))
+    L[:, 0, 0] = np.sqrt(np.maximum(C[:, 0, 0], _MIN_M2))
     L[:, 1, 0] = C[:, 1, 0] / L[:, 0, 0]
-    L[:, 1, 1] = np.sqrt(np.maximum(C[:, 1, 1] - np.square(L[:, 1, 0]), _LEAST_M2))
+    L[:, 1, 1] = np.sqrt(np.maximum(C[:, 1, 1] - np.square(L[:, 1, 0]), _MIN_M2))
     out: Floats = axes @ L
     return out
 

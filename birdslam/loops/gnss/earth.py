@@ -19,11 +19,11 @@ from birdslam.geometry.se2 import SE2, wrap
 from birdslam.loops.map_pose import EarthPose
 from birdslam.types import NS_PER_S
 
-LEAST_FIXES, LEAST_WAY_M = 3, 20.0
+MIN_FIXES, MIN_WAY_M = 3, 20.0
 GATE = 3.0  # standard deviations
 DELAYS_S = np.arange(-2.0, 2.01, 0.1)
 DELAY_SIGMA_S = 0.5
-WINDOW_S, MOST_WINDOWS = 60.0, 10  # in which fixes are compared with odometry for their delay
+WINDOW_S, MAX_WINDOWS = 60.0, 10  # in which fixes are compared with odometry for their delay
 ITERATIONS, WINDOW_ITERATIONS = 30, 16
 SCALE_SIGMA = 0.1  # of the scale's logarithm, by the camera's file
 SPEED_SIGMA = 0.01  # of all speeds of a drive together, which receivers smooth
@@ -164,17 +164,17 @@ def place_on_earth(t_ns: Ints, poses: list[SE2], fixes: list[GnssFix]) -> Earth:
     late_m = delay_sigma_s * float(np.hypot(*np.diff(xy, axis=0).T).sum() / seconds[-1])
     at = times - delay_s
     inside = (at >= seconds[0]) & (at <= seconds[-1])
-    if inside.sum() < LEAST_FIXES:
-        raise EarthError(f"{len(fixes)} fixes, and fewer than {LEAST_FIXES} of them within the drive's time")
+    if inside.sum() < MIN_FIXES:
+        raise EarthError(f"{len(fixes)} fixes, and fewer than {MIN_FIXES} of them within the drive's time")
     here = np.column_stack([np.interp(at[inside], seconds, column) for column in xy.T])
     ratios = _speed_ratios(seconds, xy, times - delay_s, fixes)
     log_scale = _log_scale(ratios)
     parameters, cov, chi2 = fit(here, enu[inside], sigma[inside], log_scale=log_scale)
     way_m = float(np.linalg.norm(np.ptp(here, axis=0)))
-    if way_m < LEAST_WAY_M:
-        raise EarthError(f"the drive goes {way_m:.0f} m between its fixes: {LEAST_WAY_M:g} m are needed for a heading")
+    if way_m < MIN_WAY_M:
+        raise EarthError(f"the drive goes {way_m:.0f} m between its fixes: {MIN_WAY_M:g} m are needed for a heading")
     good = chi2 < GATE**2
-    if good.sum() < LEAST_FIXES:
+    if good.sum() < MIN_FIXES:
         raise EarthError(f"only {int(good.sum())} of {len(chi2)} fixes fit the drive's way")
     error_m = np.sqrt(chi2[good]) * sigma[inside][good]
     return Earth(
@@ -202,10 +202,10 @@ def _delay(seconds: Floats, xy: Floats, times: Floats, enu: Floats, sigma: Float
     begin, windows = 0, []
     for end in range(1, len(times) + 1):
         if end == len(times) or times[end] - times[begin] > WINDOW_S:
-            if end - begin > LEAST_FIXES:
+            if end - begin > MIN_FIXES:
                 windows.append(slice(begin, end))
             begin = end
-    windows = windows[:: max(1, -(-len(windows) // MOST_WINDOWS))]
+    windows = windows[:: max(1, -(-len(windows) // MAX_WINDOWS))]
     costs = []
     for delay_s in DELAYS_S:
         cost = 0.5 * (delay_s / DELAY_SIGMA_S) ** 2
@@ -213,7 +213,7 @@ def _delay(seconds: Floats, xy: Floats, times: Floats, enu: Floats, sigma: Float
             at = times[window] - delay_s
             inside = (at >= seconds[0]) & (at <= seconds[-1])
             cost += float((~inside).sum()) * math.log1p(GATE**2)
-            if inside.sum() > LEAST_FIXES:
+            if inside.sum() > MIN_FIXES:
                 here = np.column_stack([np.interp(at[inside], seconds, column) for column in xy.T])
                 chi2 = fit(here, enu[window][inside], sigma[window][inside], WINDOW_ITERATIONS)[2]
                 cost += float(np.log1p(chi2).sum())
@@ -282,7 +282,7 @@ def _speed_ratios(seconds: Floats, xy: Floats, at: Floats, fixes: list[GnssFix])
 def _log_scale(ratios: list[float]) -> tuple[float, float]:
     """What the fixes' speeds, by their median, and the camera's file tell of the scale."""
     by_file = SCALE_SIGMA**-2
-    if len(ratios) < LEAST_FIXES:
+    if len(ratios) < MIN_FIXES:
         return 0.0, SCALE_SIGMA
     logs = -np.log(ratios)
     middle = float(np.median(logs))

@@ -19,7 +19,7 @@ import numpy as np
 from birdslam.geometry.arrays import Ints
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.closing import PlaceFactor, Solved, close_loops, inliers
-from birdslam.loops.gnss.earth import LEAST_FIXES, Earth, EarthError, GnssFix, fit
+from birdslam.loops.gnss.earth import MIN_FIXES, Earth, EarthError, GnssFix, fit
 from birdslam.loops.keyframe import Fixed, Link, Placed
 from birdslam.types import NS_PER_S
 
@@ -92,7 +92,7 @@ def tie(earth: Earth, keyframes: Sequence[Placed], links: Sequence[Link], fixed:
             for number, (x, y) in zip(numbers, flat.xy(degrees), strict=True)
         ]
         kept = inliers(nodes, links, factors)
-        if kept.sum() < LEAST_FIXES:
+        if kept.sum() < MIN_FIXES:
             raise EarthError(f"only {int(kept.sum())} of {len(kept)} fixes fit the drive's way")
         solved = close_loops(nodes, links, [factor for factor, fits in zip(factors, kept, strict=True) if fits])
         T_map_earth = first.T_map_keyframe @ solved[first.number][0].inverse()

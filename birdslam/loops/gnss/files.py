@@ -16,8 +16,8 @@ from birdslam.loops.gnss.earth import DEFAULT_SIGMA_M, GnssFix, is_on_earth
 from birdslam.loops.gnss.sentences import SIGMA_PER_HDOP_M, NmeaReader, Sentence
 from birdslam.types import NS_PER_S
 
-MOST_BYTES, MOST_FIXES = 1 << 26, 1_000_000
-MOST_S = 4e9  # of a time in seconds, either way
+MAX_BYTES, MAX_FIXES = 1 << 26, 1_000_000
+MAX_S = 4e9  # of a time in seconds, either way
 DAY_S = 86_400.0
 GNSS_FILE = "gnss.csv"  # of the fixes that came while a car drove, in the drive's folder
 COLUMNS = "time_s, latitude_deg, longitude_deg, and where known sigma_m, speed_mps"
@@ -29,8 +29,8 @@ class GnssError(ValueError):
 
 def read_fixes(data: bytes, name: str, begin_ns: int) -> list[GnssFix]:
     """The fixes of a file's bytes, by their times; `begin_ns`: the recording's first time. Raises GnssError."""
-    if len(data) > MOST_BYTES:
-        raise GnssError(f"{name}: is larger than {MOST_BYTES >> 20} MiB")
+    if len(data) > MAX_BYTES:
+        raise GnssError(f"{name}: is larger than {MAX_BYTES >> 20} MiB")
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -44,8 +44,8 @@ def read_fixes(data: bytes, name: str, begin_ns: int) -> list[GnssFix]:
         fixes, utc = _csv(text, name), False
     if not fixes:
         raise GnssError(f"{name}: has no fix")
-    if len(fixes) > MOST_FIXES:
-        raise GnssError(f"{name}: has more than {MOST_FIXES} fixes")
+    if len(fixes) > MAX_FIXES:
+        raise GnssError(f"{name}: has more than {MAX_FIXES} fixes")
     first_s, first_ns = 0.0, 0
     if utc and abs(fixes[0][0] - begin_ns / NS_PER_S) > DAY_S:
         first_s, first_ns = fixes[0][0], begin_ns
@@ -80,7 +80,7 @@ _Fix = Sentence
 
 
 def _checked(name: str, line: int, t_s: float, lat: float, lon: float, sigma_m: float, speed: float | None) -> _Fix:
-    whole = math.isfinite(t_s) and abs(t_s) < MOST_S and is_on_earth(lat, lon)
+    whole = math.isfinite(t_s) and abs(t_s) < MAX_S and is_on_earth(lat, lon)
     fine = math.isfinite(sigma_m) and 0.0 < sigma_m < 1e5 and (speed is None or 0.0 <= speed < 200.0)
     if not (whole and fine):
         raise GnssError(f"{name}: line {line} is no fix: {t_s:g} s, {lat:g}, {lon:g}, sigma {sigma_m:g} m")

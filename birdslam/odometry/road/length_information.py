@@ -13,8 +13,8 @@ from collections.abc import Sequence
 import numpy as np
 
 OTHER_LENGTHS_LOG = (-0.35, -0.2, 0.2, 0.35)  # over which a fit must be likelier
-_MOST_SHARE = 0.99  # of the gain, by which the width of the maximum can still be told
-_LEAST = 1e-6  # of the variance that a correlation leaves
+_MAX_SHARE = 0.99  # of the gain, by which the width of the maximum can still be told
+_MIN_VARIANCE_RATIO = 1e-6  # of the variance that a correlation leaves
 
 
 def length_information(fitted: float, others: Sequence[float], samples: float) -> float:
@@ -23,14 +23,14 @@ def length_information(fitted: float, others: Sequence[float], samples: float) -
     `fitted` is the images' correlation by the fit, `others` those with the lengths of OTHER_LENGTHS_LOG. Where any is
     as likely it is 0, or less by chance.
     """
-    unexplained = float(np.log(min(_left(fitted), 1.0 - _LEAST)))
+    unexplained = float(np.log(min(_left(fitted), 1.0 - _MIN_VARIANCE_RATIO)))
     most, out = -0.5 * samples * unexplained, np.inf
     for off, other in zip(OTHER_LENGTHS_LOG, others, strict=True):
         share = 1.0 - float(np.log(_left(other))) / unexplained
-        out = min(out, -2.0 * most * float(np.log1p(-min(share, _MOST_SHARE))) / off**2)
+        out = min(out, -2.0 * most * float(np.log1p(-min(share, _MAX_SHARE))) / off**2)
     return out
 
 
 def _left(correlation: float) -> float:
     """The share of the variance that a correlation leaves unexplained."""
-    return max(1.0 - max(correlation, 0.0) ** 2, _LEAST)
+    return max(1.0 - max(correlation, 0.0) ** 2, _MIN_VARIANCE_RATIO)

@@ -11,7 +11,7 @@ from birdslam.geometry.camera import Camera, GroundPlane
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-FARTHEST_M = 30.0
+MAX_DISTANCE_M = 30.0
 _BESIDE_PX, _BELOW_PX = 3, 6  # a box ends above its vehicle's shadow
 # By night a vehicle's lamps glow beyond its box, within reach of a corner's tracking window: half of 8 x 20 px, twice
 # that across in the pyramid's next level. On rendered nights 5 px keep such corners, 8 px none
@@ -42,7 +42,7 @@ def on_road(
     """(N,) which of the pixels (N, 2) show road: in the mask (H, W), else in a strip in front; outside vehicles."""
     rays = rays_cam(camera, px)
     rho = -(rays @ ground.normal_cam) / camera.height_m  # inverse depth on the road, Eq. 1
-    keep = (rho > 1.0 / FARTHEST_M) & outside(px, boxes_px)
+    keep = (rho > 1.0 / MAX_DISTANCE_M) & outside(px, boxes_px)
     if road_mask is not None:
         u, v = np.round(px).astype(np.int64).T
         height_px, width_px = road_mask.shape

@@ -7,7 +7,7 @@ from birdslam.odometry.scale_config import RoadScaleConfig
 TOLD = 0.5  # of an alignment's information about the length (kalman_filter.py): with more it counts as told
 _COMPARISONS = 5  # time constant of the mean of what they tell
 _ANOTHER_LOG = 0.3  # of the factor on the length by an alignment: a larger one begins the row anew
-_MOST_AGAINST = 10.0  # alignments that agreed on the length before, which as many must outweigh
+_MAX_AGAINST = 10.0  # alignments that agreed on the length before, which as many must outweigh
 _REMEMBERED, _FOUND = 20, 2  # rejected alignments, and how many of them must have found the same length
 _SAME_LOG = 0.2  # of two lengths that are the same
 
@@ -96,5 +96,5 @@ class ScaleConfirmation:
     def confirm(self, tells: float, log_factor: float) -> None:
         """It has changed the length by this factor."""
         if abs(log_factor) > _ANOTHER_LOG:
-            self._against, self._told = min(self._told, _MOST_AGAINST), 0.0
+            self._against, self._told = min(self._told, _MAX_AGAINST), 0.0
         self._told += tells

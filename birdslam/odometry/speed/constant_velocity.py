@@ -27,7 +27,7 @@ Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 _SIDESTEP_M = 0.002
 _WEAK_PRIOR = np.diag([1e-2] * 3 + [1e2] * 3)  # 10 m and 0.1 rad: a direction that the images do not see
 _STEEPEST = 0.2  # of a way's direction beside the camera's axis, as far as it is learnt
-_LEAST_STEP_M = 0.1  # of a motion whose direction is learnt
+_MIN_STEP_M = 0.1  # of a motion whose direction is learnt
 
 
 class ConstantVelocityConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -94,7 +94,7 @@ class ConstantVelocityPrior:
         elif np.isfinite(var):
             gain = cov[:, 0] / (cov[0, 0] + var)
             self._x, self._cov = x + gain * (speed - x[0]), cov - np.outer(gain, cov[0])
-        if not self.active and step.x_m > _LEAST_STEP_M:
+        if not self.active and step.x_m > _MIN_STEP_M:
             aside = (step.y_m - self._ahead_m * step.yaw_rad) / step.x_m
             share = -math.expm1(-step.x_m / self.config.heading_memory_m)
             self._heading_rad += share * (min(max(aside, -_STEEPEST), _STEEPEST) - self._heading_rad)

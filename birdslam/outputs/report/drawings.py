@@ -15,8 +15,8 @@ from birdslam.outputs.report.wording import frame_words, invalidates, status_nam
 from birdslam.types import Status
 
 SMOOTHED_S = 0.5  # over which the speed that is drawn is a mean
-MOST_POINTS = 4000  # of a line
-MOST_TRACK_POINTS = 200
+MAX_POINTS = 4000  # of a line
+MAX_TRACK_POINTS = 200
 # A frame is of the first of these that it fits
 KINDS = (("not valid", "#d1342f"), ("stands", "#8b95a5"), ("valid, with remarks", "#e0a100"), ("valid", "#1f9d6b"))
 # No remarks: networks look at some pictures alone, and their answers hold until the next
@@ -27,7 +27,7 @@ LINE_COLOUR, LANDMARK_COLOUR = "#b48a00", "#8b95a5"
 Trace = dict[str, Any]
 
 
-def thinned(count: int, most: int = MOST_POINTS) -> Ints:
+def thinned(count: int, most: int = MAX_POINTS) -> Ints:
     """The rows that are drawn of so many."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
 
@@ -179,7 +179,7 @@ def _broken_line(name: str, ways: list[tuple[Floats, Floats]], colour: str, widt
 
 
 def _track(track: TrackTable, kind: str, first: bool) -> Trace:
-    rows = thinned(len(track.t_s), MOST_TRACK_POINTS)
+    rows = thinned(len(track.t_s), MAX_TRACK_POINTS)
     label = html.escape(f"{track.label} {track.name}")
     right, up = _up(track.xy_m[rows])
     return {

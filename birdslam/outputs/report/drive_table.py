@@ -29,10 +29,10 @@ FILES = {  # what the page hands out, where it is there
     "road.geojson": "the road's lines on Earth, GeoJSON",
     "tracks.geojson": "other vehicles' ways on Earth, GeoJSON",
 }
-MOST_FILE_BYTES = 1_500_000  # of one that the page holds
-MOST_TRACKS, FEWEST_ROWS = 150, 5  # a track of fewer frames is mostly a false alarm
-MOST_MAP_POINTS = 6000
-MOST_WAYS = 400  # on Earth, of lines and of vehicles
+MAX_FILE_BYTES = 1_500_000  # of one that the page holds
+MAX_TRACKS, FEWEST_ROWS = 150, 5  # a track of fewer frames is mostly a false alarm
+MAX_MAP_POINTS = 6000
+MAX_WAYS = 400  # on Earth, of lines and of vehicles
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ def read_drive(directory: Path) -> DriveTable:
             scale_sigma_rel=numbers[:, 7],
             valid=numbers[:, 8] > 0.5,
             statuses=[tuple(row["status"].split()) for row in rows],
-            tracks=sorted(tracks, key=lambda track: -len(track.t_s))[:MOST_TRACKS],
+            tracks=sorted(tracks, key=lambda track: -len(track.t_s))[:MAX_TRACKS],
             lanes_m=lanes,
             lines=_lines(directory / "map.geojson", to_plane),
             earth=_earth(directory, numbers[0, 1]),
@@ -161,7 +161,7 @@ def _map_points(path: Path, kind: str, to_plane: dict[int, SE2]) -> Floats:
             if row["kind"] == kind and int(row["epoch"]) in to_plane:
                 of_epoch.setdefault(int(row["epoch"]), []).append((float(row["x_m"]), float(row["y_m"])))
     points = [to_plane[epoch] @ np.array(xy) for epoch, xy in of_epoch.items()]
-    every = max(1, -(-sum(map(len, points)) // MOST_MAP_POINTS))
+    every = max(1, -(-sum(map(len, points)) // MAX_MAP_POINTS))
     return np.vstack([np.zeros((0, 2)), *points])[::every]
 
 
@@ -194,7 +194,7 @@ def _ways(path: Path) -> list[Floats]:
     if not path.is_file():
         return []
     features = json.loads(path.read_text(encoding="utf-8"))["features"]
-    return [np.array(each["geometry"]["coordinates"], np.float64)[:, ::-1] for each in features[:MOST_WAYS]]
+    return [np.array(each["geometry"]["coordinates"], np.float64)[:, ::-1] for each in features[:MAX_WAYS]]
 
 
 def _camera(path: Path, summary: dict[str, Any]) -> str:
@@ -213,7 +213,7 @@ def _files(directory: Path) -> dict[str, str]:
     return {
         name: path.read_text(encoding="utf-8")
         for name, path in there.items()
-        if path.is_file() and path.stat().st_size <= MOST_FILE_BYTES
+        if path.is_file() and path.stat().st_size <= MAX_FILE_BYTES
     }
 
 

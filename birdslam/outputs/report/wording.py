@@ -14,7 +14,7 @@ from birdslam.outputs.plain_words import MEANINGS, meaning
 from birdslam.outputs.report.drive_table import FILES, DriveTable, EarthTable
 from birdslam.types import INVALIDATING, Status
 
-MOST_STRETCHES = 40  # of frames that are not valid
+MAX_STRETCHES = 40  # of frames that are not valid
 
 
 def frame_words(drive: DriveTable, k: int) -> str:
@@ -65,14 +65,14 @@ def status_rows(drive: DriveTable) -> str:
 def invalid_rows(drive: DriveTable) -> str:
     """A row a stretch of frames that may not be driven by: when, how many, and why."""
     stretches, rows = drive.stretches(~drive.valid), []
-    for begin, end in stretches[:MOST_STRETCHES]:
+    for begin, end in stretches[:MAX_STRETCHES]:
         why = dict.fromkeys(name for here in drive.statuses[begin:end] for name in here if invalidates(name))
         when = f"{drive.t_s[begin]:.1f} to {drive.t_s[end - 1] + drive.step_s:.1f} s"
         reason = html.escape("; ".join(map(meaning, why)) or "before anything is known")
         rows.append(f"<tr><td>{when}</td><td>{_frames(end - begin)}</td><td>{reason}</td></tr>")
-    if len(stretches) > MOST_STRETCHES:
-        left = int(sum(end - begin for begin, end in stretches[MOST_STRETCHES:]))
-        rest = f"{len(stretches) - MOST_STRETCHES} more such stretches: frames.csv has them"
+    if len(stretches) > MAX_STRETCHES:
+        left = int(sum(end - begin for begin, end in stretches[MAX_STRETCHES:]))
+        rest = f"{len(stretches) - MAX_STRETCHES} more such stretches: frames.csv has them"
         rows.append(f"<tr><td>later</td><td>{_frames(left)}</td><td>{rest}</td></tr>")
     return "".join(rows) or "<tr><td>none: each frame is valid</td></tr>"
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from birdslam.geometry.arrays import Floats, Floats32, Ints
 from birdslam.perception.decoding.detection import (
-    MOST_CANDIDATES,
+    MAX_CANDIDATES,
     Candidates,
     Detections,
     candidates_in_image,
@@ -35,7 +35,7 @@ class _ListDecoder:
         scores = _scores(numbers, scoring)[:, self._wanted]
         rows, columns = np.nonzero(scores >= self._detector.score_threshold)
         found = scores[rows, columns]
-        best = np.argsort(-found, kind="stable")[:MOST_CANDIDATES]
+        best = np.argsort(-found, kind="stable")[:MAX_CANDIDATES]
         return rows[best], self._wanted[columns[best]], found[best]
 
     def merge(self, parts: Sequence[Candidates], views: Sequence[View]) -> Detections:

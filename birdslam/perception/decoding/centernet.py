@@ -9,7 +9,7 @@ import numpy as np
 
 from birdslam.geometry.arrays import Floats32
 from birdslam.perception.decoding.detection import (
-    MOST_CANDIDATES,
+    MAX_CANDIDATES,
     Candidates,
     Detections,
     candidates_in_image,
@@ -49,7 +49,7 @@ class CenterNetDecoder:
         around = np.stack([cv2.dilate(plane, np.ones((3, 3), np.uint8)) for plane in heat])
         planes, rows, columns = np.nonzero((heat >= table.score_threshold) & (heat == around))
         scores = heat[planes, rows, columns].astype(np.float64)
-        best = np.argsort(-scores, kind="stable")[:MOST_CANDIDATES]
+        best = np.argsort(-scores, kind="stable")[:MAX_CANDIDATES]
         planes, rows, columns, scores = planes[best], rows[best], columns[best], scores[best]
         centre = np.column_stack([columns, rows]).astype(np.float64)
         if table.offsets:

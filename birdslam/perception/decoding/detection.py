@@ -14,7 +14,7 @@ from birdslam.perception.views import View
 
 CUT_MARGIN = 0.015  # of a tile's width: a box that ends so near to a tile's inner edge is taken to go on behind it
 INSIDE = 0.6  # of a cut box's area inside a whole box: the same object
-MOST_CANDIDATES = 400  # of one run: a network that fails must not cost memory and time without bound
+MAX_CANDIDATES = 400  # of one run: a network that fails must not cost memory and time without bound
 SAME_ROWS = 0.5  # overlap over union of the rows of two halves of one object
 MIN_BODY_IOU = 0.5  # of two networks' boxes of one object, as of a match in most benchmarks
 
@@ -104,7 +104,7 @@ class YoloxDecoder:
         classes = np.argmax(chosen[:, 5:], axis=1)
         scores = chosen[:, 4] * chosen[np.arange(len(rows)), 5 + classes]
         good = (scores >= self.table.score_threshold) & self._wanted[classes]
-        best = np.flatnonzero(good)[np.argsort(-scores[good], kind="stable")[:MOST_CANDIDATES]]
+        best = np.flatnonzero(good)[np.argsort(-scores[good], kind="stable")[:MAX_CANDIDATES]]
         rows, chosen, classes, scores = rows[best], chosen[best], classes[best], scores[best]
         with np.errstate(over="ignore"):
             half = np.exp(chosen[:, 2:4]) * self._strides[rows] / 2.0

@@ -42,7 +42,7 @@ MEAN_SIZE_M = (4.3, 1.8, 1.6)
 # By how much sizes are off on real cars, a car's means: images of KITTI tracking 0002 and 0005 (`perf networks`). On
 # held-out simulated frames it is 0.10, 0.045 and 0.07: real cars are shorter and narrower than those it learned from
 SIGMA_SIZE_REL = (0.20, 0.15, 0.08)
-MOST_CANDIDATES = 100  # of one run
+MAX_CANDIDATES = 100  # of one run
 _LOG_SIDE_MAX = 6.0  # a side of 400 cells is longer than any input
 
 
@@ -143,7 +143,7 @@ class MultiTaskDecoder:
         bar = math.log(self.table.score_threshold / (1.0 - self.table.score_threshold))
         peaks = [(plane >= cv2.dilate(plane, self._kernel)) & (plane > bar) for plane in heat]
         classes, ys, xs = np.nonzero(peaks)
-        best = np.argsort(-heat[classes, ys, xs], kind="stable")[:MOST_CANDIDATES]
+        best = np.argsort(-heat[classes, ys, xs], kind="stable")[:MAX_CANDIDATES]
         return classes[best], ys[best], xs[best]
 
     def _bodies(self, at: Floats, cells: Floats, view: View, focal_rel: float) -> Boxes3d:

@@ -12,7 +12,7 @@ from birdslam.perception.decoding.segmentation import Segmentation
 from birdslam.perception.manifest import Input, ManifestMismatch, RowAnchors
 from birdslam.perception.views import View
 
-LEAST_POINTS = 2  # of a line
+MIN_POINTS = 2  # of a line
 LINE_REL = 0.006  # thickness of a drawn line in widths of the image: what a painted line has some 15 m ahead
 
 
@@ -53,7 +53,7 @@ class RowAnchorsDecoder:
         out = []
         for k in range(self.table.lines):
             rows = np.flatnonzero(there[:, k])
-            if len(rows) >= LEAST_POINTS:
+            if len(rows) >= MIN_POINTS:
                 rows = rows[np.argsort(y_px[rows])]
                 points = np.column_stack([x_px[rows, k], y_px[rows]])
                 out.append(view.to_image(np.tile(points, 2))[:, :2] - 0.5)  # from pixels' edges to their centres

@@ -18,7 +18,7 @@ from birdslam.sources.recording import DatasetError
 
 FULL_FRAME_MM = 36.0  # across
 _FOCAL_KEY = re.compile(rb"focal_length.*35mm", re.IGNORECASE)
-_MOST_BYTES = 1 << 26  # of the index: an hour has some MB
+_MAX_BYTES = 1 << 26  # of the index: an hour has some MB
 # Of a transport stream: packets, of a camera's with a time of four bytes before each, begin with the same byte
 _PACKET_BYTES, _SYNC_BYTE, _SYNCED = {188: 0, 192: 4}, 0x47, 4
 _INSIDE = (b"moov", b"trak", b"udta", b"mdia")
@@ -68,7 +68,7 @@ def stated_focal_rel(path: Path) -> float | None:
         return None
     try:
         moov = next((box for box in _boxes_of_file(path) if box.name == b"moov"), None)
-        if moov is None or moov.end - moov.begin > _MOST_BYTES:
+        if moov is None or moov.end - moov.begin > _MAX_BYTES:
             return None
         focal_mm = _focal_mm(_read(path, moov.begin, moov.end - moov.begin))
     except OSError:

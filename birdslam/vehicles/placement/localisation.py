@@ -39,7 +39,7 @@ DIMENSIONS = {
     "motorcycle": Dimensions(2.1, 0.8, 1.6, sigma_height_rel=0.12),
 }
 STEP_M = 0.1  # of a depth, over which a slope is taken
-NEAREST_M = 1.0  # a nearer vehicle is out of the image
+MIN_DISTANCE_M = 1.0  # a nearer vehicle is out of the image
 CENTRE_STEPS = 3  # each leaves about a tenth of the error
 HIDING_FRACTION = 0.1  # of a box's side: a nearer box that covers less hides nothing
 
@@ -223,7 +223,7 @@ def place(seen: Observation, log_depth: float, var_depth: float, yaw_rad: float,
         # What is seen of it is narrower than its outline: the rest is beside the ego, nearer than what is seen
         narrower = max(0.0, config.cut_width_rel - seen.tan_width / outline)
         hidden_m = min(config.cut_length_rel * narrower, 1.0) * 2.0 * reach_m
-        nearest_m = max(depth_m - hidden_m, NEAREST_M)
+        nearest_m = max(depth_m - hidden_m, MIN_DISTANCE_M)
         x_m, y_m, reach_m, _ = centre_at(seen, nearest_m, yaw_rad, config)
         # The one edge that is seen is a corner's, behind the centre: the centre moves along that edge's line of sight
         farther_x_m, farther_y_m, *_ = centre_at(seen, nearest_m + STEP_M, yaw_rad, config)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from birdslam.geometry import bev
 from birdslam.geometry.camera import PLANE_AT_M
 from birdslam.geometry.se2 import SE2
-from birdslam.vehicles.placement.localisation import NEAREST_M, Observation
+from birdslam.vehicles.placement.localisation import MIN_DISTANCE_M, Observation
 
 Floats = NDArray[np.float64]
 
@@ -59,7 +59,7 @@ def measure_boxes(
     `roof_m2` (N,): how far the camera stands above the roof times how far the roof reaches along the line of sight.
     `vertical_per_m`: the road's vertical curvature; bottoms count from the plane's horizon.
     """
-    depth = np.maximum(centres_m[:, 0] - extents_m[:, 0] / 2.0, NEAREST_M)
+    depth = np.maximum(centres_m[:, 0] - extents_m[:, 0] / 2.0, MIN_DISTANCE_M)
     over_roof = roof_m2 / (depth * (depth + extents_m[:, 0]))
     sigma = [
         (
@@ -88,8 +88,8 @@ def linearised(x: Floats, boxes: ParallaxMeasurements, T_world_ego: SE2, height_
     """Innovations (N, K, 4) and their derivatives (N, K, 4, 8) by the states x (N, K, 8); `height_m`: the camera's."""
     R_ego_world = T_world_ego.rotation().T
     at = (x[..., :2] - [T_world_ego.x_m, T_world_ego.y_m]) @ R_ego_world.T
-    depth = np.maximum(at[..., 0] - boxes.reach_m[:, None], NEAREST_M)
-    ahead = np.maximum(at[..., 0], NEAREST_M)
+    depth = np.maximum(at[..., 0] - boxes.reach_m[:, None], MIN_DISTANCE_M)
+    ahead = np.maximum(at[..., 0], MIN_DISTANCE_M)
     level = bev.road_slope(depth, height_m + x[..., KERB])  # Eq. 1
     slope = np.maximum(level - x[..., TILT], MIN_SLOPE)
     J = np.zeros((*x.shape[:2], len(CUES), len(STATES)))

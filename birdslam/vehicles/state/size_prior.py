@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 MIN_VARIANCE = 1e-12  # of a height that its class knows exactly
-_LEAST_CHANGE = 0.02  # of a weight: a smaller one is left for later
+_MIN_CHANGE = 0.02  # of a weight: a smaller one is left for later
 
 
 class SizePrior:
@@ -87,7 +87,7 @@ class SizePrior:
         own = x[at] - x[common] - self.log_height[rows]
         variance = P[at, at] - 2.0 * P[at, common] + P[common, common]
         weight = (self.dof - 1.0) / (self.dof + (own**2 + variance) / self._scale2[rows])
-        for k in np.flatnonzero(np.abs(weight - self._weight[rows]) > _LEAST_CHANGE).tolist():
+        for k in np.flatnonzero(np.abs(weight - self._weight[rows]) > _MIN_CHANGE).tolist():
             row = rows[k]
             change = (weight[k] - self._weight[row]) / self._scale2[row]
             x, P = _informed(x, P, (int(at[k]), common), float(self.log_height[row]), float(change))

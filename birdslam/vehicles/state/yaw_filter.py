@@ -14,7 +14,7 @@ from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
 from birdslam.vehicles.state.yaw_by_outline import YawByOutline
 from birdslam.vehicles.track import Track, TrackingConfig
 
-LEAST_TURN_RAD = 0.02  # a smaller turn is none, so that yaws that are not known don't quiver
+MIN_TURN_RAD = 0.02  # a smaller turn is none, so that yaws that are not known don't quiver
 MOTION_LOGIT = 6.0  # log odds of the front of a vehicle that was seen to move
 
 
@@ -77,7 +77,7 @@ class YawFilter:
             return
         yaw_rad, track.sigma_yaw_rad = outline.estimate(row, track.yaw_rad)
         turn = wrap(yaw_rad - track.yaw_rad)
-        if abs(turn) > LEAST_TURN_RAD:
+        if abs(turn) > MIN_TURN_RAD:
             self._turn(row, track, turn)
 
     def _correct(self, row: int, track: Track, turn: float, variance: float) -> None:

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 import msgspec
 import numpy as np
 
-from birdslam.bench.tracking.metrics import LEAST_HEIGHT_PX, BoxFrame, assign, hota_parts, identities, mostly_inside
+from birdslam.bench.tracking.metrics import MIN_HEIGHT_PX, BoxFrame, assign, hota_parts, identities, mostly_inside
 from birdslam.geometry.arrays import Floats, Ints
 from birdslam.sources.kitti import KITTI_RATE_HZ
 from birdslam.sources.kitti_tracking import TrackingSequence
@@ -124,7 +124,7 @@ def _frame(
     matched = {int(j): bool(asked[i]) for i, j in zip(*assign(similarity), strict=True)}
     regions = np.array([label.box_px for label in here if label.kind == DONT_CARE]).reshape(-1, 4)
     counts = [
-        matched[j] if j in matched else box[3] - box[1] > LEAST_HEIGHT_PX and not mostly_inside(box, regions)
+        matched[j] if j in matched else box[3] - box[1] > MIN_HEIGHT_PX and not mostly_inside(box, regions)
         for j, box in enumerate(tracks.boxes_px)
     ]
     kept = np.array(counts, dtype=np.bool_)
