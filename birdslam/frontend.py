@@ -192,7 +192,7 @@ class FrontEnd:
             self._lanes.clear()
             return None, None
         if Status.SCALE_INVALID in motion.status:
-            self._lanes.lose_way()
+            self._lanes.forget_position()
         return motion, self._dead_reckoning.advance(motion)
 
     def _localise_vehicles(

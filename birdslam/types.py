@@ -641,10 +641,10 @@ class Estimate(msgspec.Struct, frozen=True, kw_only=True):
     """optimize -> planners, one for each frame: the poses of the ego and all other vehicles (paper, Sec. 3).
 
     Poses are in m and rad in the world of `epoch`, covariances (3, 3) row-major of the tangent (x_m, y_m, yaw_rad).
-    With a new `epoch` the world frame began anew: poses of different epochs must not be compared.
+    With a new `epoch` the world frame restarted: poses of different epochs must not be compared.
     """
 
-    epoch: int  # number of the world frame, raised where that began anew
+    epoch: int  # number of the world frame, raised where that restarted
     frame_id: FrameId  # as capture counts them; never falls within a run
     t_source_ns: int  # the camera's or the recording's own clock
     t_capture_ns: int  # CLOCK_MONOTONIC of the vehicle's computer

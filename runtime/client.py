@@ -1,7 +1,7 @@
 """The planner's client: live estimates, with alive, on time and valid as separate answers.
 
 A planner can start before the system does, and lives through its restarts (`Estimate.epoch` then says that the world
-frame began anew). It can never slow the vehicle down: a planner that is busy gets only the newest estimate. One that
+frame restarted). It can never slow the vehicle down: a planner that is busy gets only the newest estimate. One that
 comes late has the last estimate at once, and queries the rest: `map`, `trajectory`, `nearby`, `configuration`,
 `health`.
 """

@@ -115,7 +115,7 @@ class Configuration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
     @property
     def restarts(self) -> bool:
-        """Whether a node that died is begun anew."""
+        """Whether a node that died is restarted."""
         restart = self.runtime.restart
         return not self.lossless if restart is None else restart == "always"
 

@@ -10,7 +10,7 @@ ENVIRONMENT = {
     "OPENCV_FFMPEG_LOGLEVEL": "-8",  # FFmpeg prints every damaged block of a film; a status reports the frame
     "ORT_DISABLE_TELEMETRY": "1",  # onnxruntime's wheels come with it on
     # glibc: what a frame's images leave is for those of the next, in place of going back to the kernel, which hands out
-    # each page anew with a fault (docs/deployment.md)
+    # each page again with a fault (docs/deployment.md)
     "MALLOC_MMAP_THRESHOLD_": str(32 << 20),  # the most that it takes
     "MALLOC_TRIM_THRESHOLD_": str(1 << 32),
     "MALLOC_TOP_PAD_": str(16 << 20),

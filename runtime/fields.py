@@ -61,7 +61,7 @@ def fields(struct: type[msgspec.Struct], default: Any = None, prefix: str = "") 
 
 @cache
 def _own(struct: type[msgspec.Struct]) -> tuple[kinds.Field, ...]:
-    """A struct's fields without those of the structs within it; msgspec translates its annotations anew each time."""
+    """A struct's fields without those of the structs within it; msgspec translates its annotations again each time."""
     info = kinds.type_info(struct)
     assert isinstance(info, kinds.StructType)
     return info.fields

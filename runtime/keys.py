@@ -31,7 +31,7 @@ GROUPS = (
             "as fast as can be",
             "source.stride": "One image of a recording in how many?",
             "source.frames": "After how many images does the run end? none: with the source",
-            "source.loop": "Does a recording begin anew at its end?",
+            "source.loop": "Does a recording restart at its end?",
             "source.topics.image": 'Which topic of a ROS bag has the images? "": the only one that is there',
             "source.topics.camera_info": "Which has the camera's numbers? \"\": the one beside the images' topic, or "
             "the only one",
@@ -209,7 +209,7 @@ GROUPS = (
             "runtime.ready_timeout_s": "How long may a node take to load, to warm up and to find the others?",
             "runtime.watchdog_ms": "After how long without a sign of life has a node stalled? none: 2 s, at rate "
             '"max" a minute',
-            "runtime.restart": 'Is a node that died or stalled begun anew? none: "always", but "never" at rate "max", '
+            "runtime.restart": 'Is a node that died or stalled restarted? none: "always", but "never" at rate "max", '
             "which may lose no image",
             "runtime.restarts_max": "How often may that be, before the run ends?",
             "runtime.restart_window_s": "Within which time do these restarts count?",

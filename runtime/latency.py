@@ -29,7 +29,7 @@ class Distribution:
         self.max_ms = max(self.max_ms, ms)
 
     def joined(self, other: Distribution) -> Distribution:
-        """Both together, anew."""
+        """Both together, again."""
         out = Distribution()
         out.count, out.max_ms = self.count + other.count, max(self.max_ms, other.max_ms)
         out._bins = self._bins + other._bins

@@ -59,7 +59,7 @@ class Progress:
         """So much is done in all."""
         self.done = done
         now_s = self._clock()
-        if self._first is None or done < self._first[1]:  # a second pass begins anew
+        if self._first is None or done < self._first[1]:  # a second pass restarts
             self._first = now_s, done
         if now_s < self._due_s:
             return

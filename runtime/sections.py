@@ -32,7 +32,7 @@ class SourceConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     detector: Family = "unknown"  # whose boxes these are, which says how sure their edges are
     topics: BagTopics = BagTopics()  # of a ROS bag
     frames: PositiveInt | None = None  # end after so many; None: all
-    loop: bool = False  # a recording begins anew at its end
+    loop: bool = False  # a recording restarts at its end
     prefetch_frames: PositiveInt = 4  # decoded ahead of their time, so that a slow file is not a late frame
     reopen_ms: Positive = 100.0  # between tries to open a camera that is gone; each is a frame without an image
     camera_timeout_s: Positive = 5.0  # a camera or stream that delivers nothing for so long has failed
@@ -155,7 +155,7 @@ class RuntimeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     watchdog_ms: Annotated[float, msgspec.Meta(ge=200.0)] | None = None
     term_grace_ms: Positive = 200.0  # between a stalled node's SIGTERM and its SIGKILL
     switch_interval_s: Positive = 5e-4  # of the GIL, for the threads that wait beside a busy one
-    # A node that died or stalled is begun anew; None: "always", but "never" at rate "max", which may lose no frame
+    # A node that died or stalled is restarted; None: "always", but "never" at rate "max", which may lose no frame
     restart: Literal["always", "never"] | None = None
     restarts_max: PositiveInt = 5  # of one node within the window: one more ends the run
     restart_window_s: Positive = 60.0  # in which they count

@@ -73,7 +73,7 @@ TOPICS = {
         # As many as a frame bears (sources/speed_log.py): what does not fit in no frame would have had
         Topic("speed", SpeedReading, CAR.name, depth=200, pace="as often as the car says it, 20 to 100 times a second"),
         Topic("frame", FrameRef, "capture", depth=1, hot=True),
-        # A lost one breaks the chain of edges: a few are queued, and an optimizer that begins anew asks for the last
+        # A lost one breaks the chain of edges: a few are queued, and an optimizer that restarts asks for the last
         Topic("measurements", Measurements, "perceive", depth=8, retained=96),
         Topic("estimate", Estimate, "optimize", depth=1, hot=True, retained=1),
         Topic("map", MapUpdate, "optimize", depth=256, pace="each frame in which the map gained something"),
@@ -144,6 +144,6 @@ def every_key(topic: str) -> str:
 
 
 def vehicle_and_topic(key: str) -> tuple[str, str] | None:
-    """What `key_of` and `alive_key` made a key of; None for all that is none of their keys."""
+    """Returns what `key_of` and `alive_key` encoded in a key; None for other keys."""
     match = _KEY.fullmatch(key)
     return (match[1], match[2]) if match else None

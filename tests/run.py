@@ -74,7 +74,7 @@ def pytest(marks: str, jobs: int, environment: Mapping[str, str], arguments: Seq
 
 
 def kernels() -> str:
-    """Which kernels the libraries have chosen on this processor."""
+    """Which kernels the libraries have tuned on this processor."""
     name = "unknown"
     for library in sorted((Path(np.__file__).parents[1] / "numpy.libs").glob("libscipy_openblas*")):
         function = getattr(ctypes.CDLL(str(library)), "scipy_openblas_get_corename64_", None)

@@ -191,7 +191,7 @@ def test_messages_that_were_lost_on_the_way_are_counted(join: Any, base: Path) -
     estimates = hub.subscriber("estimate", depth=16)
     out = join("optimize", lossless=True).publisher("estimate")
     assert out.wait_matched(LIMIT_S)
-    numbers = [("optimize", n) for n in (4, 5, 9, 1, 2)]  # 6 to 8 are lost; then it begins anew
+    numbers = [("optimize", n) for n in (4, 5, 9, 1, 2)]  # 6 to 8 are lost; then it restarts
     with foreign_session(base) as foreign:
         block, urgent = zenoh.CongestionControl.BLOCK, zenoh.Priority.REAL_TIME
         publisher = foreign.declare_publisher(key_of("car", "estimate"), congestion_control=block, priority=urgent)

@@ -125,7 +125,7 @@ class World:
         self.filter = RoadFilter(CAMERA, self.config)
         self.filter.reset_scale(1.0)
         self.car = SpeedScale(self.config, self.filter)
-        self.unit_m = unit_m  # of the odometry's unit of length
+        self.unit_m = unit_m  # of the odometry's scale
         self.trembles = np.zeros(1)  # by which one image after the other sees its way too long, as a fraction
         self.error = 0.0  # of the last way, as a fraction
         self.errors: list[float] = []  # of all of them

@@ -137,7 +137,7 @@ def test_other_settings_are_named() -> None:
 def test_parts_that_do_not_belong_together_are_refused() -> None:
     """Whole by its sum, but not what this code writes."""
     whole = unpack(checkpoint(), PoseGraph(*SETTINGS["measured"]).settings)
-    begun = whole.begun
+    begun = whole.started
     assert begun is not None
     landmarks: LandmarksState = unpacked(begun.factors[LandmarkPoints.name], LandmarksState)
     torn = packed(replace(landmarks, frames=landmarks.frames[1:]))
@@ -150,7 +150,7 @@ def test_parts_that_do_not_belong_together_are_refused() -> None:
         replace(begun, factors=begun.factors | {LandmarkPoints.name: torn}),
     ):
         with pytest.raises(CheckpointError, match="does not fit together"):
-            PoseGraph.restore(pack(replace(whole, begun=broken)), *SETTINGS["measured"])
+            PoseGraph.restore(pack(replace(whole, started=broken)), *SETTINGS["measured"])
     for lost in ({}, dict.fromkeys(begun.factors, b"")):
         with pytest.raises(CheckpointError, match="can't be read"):
-            PoseGraph.restore(pack(replace(whole, begun=replace(begun, factors=lost))), *SETTINGS["measured"])
+            PoseGraph.restore(pack(replace(whole, started=replace(begun, factors=lost))), *SETTINGS["measured"])

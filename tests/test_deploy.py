@@ -257,7 +257,7 @@ def test_install_start_break_and_remove(machine: Machine) -> None:
         assert estimates(machine)
     assert (int(machine.show("birdslam", "MainPID")), machine.show("birdslam", "NRestarts")) == (main, "0")
 
-    # The supervisor stalls: systemd's watchdog ends it and starts it anew. Then it is killed outright.
+    # The supervisor stalls: systemd's watchdog ends it and starts it again. Then it is killed outright.
     for restarts, number in enumerate((signal.SIGSTOP, signal.SIGKILL), 1):
         nodes = [node(machine, name) for name in NODES]
         assert 0 not in nodes

@@ -207,7 +207,7 @@ def test_what_was_seen_before_a_way_of_unknown_length_is_dropped() -> None:
             front.measure(frame(k), road_view())
         return front.lane_view().seen
 
-    assert np.array_equal(seen(8, 7), seen(1))  # begins anew
+    assert np.array_equal(seen(8, 7), seen(1))  # restarts
     assert np.array_equal(seen(8, 3), seen(5))
     assert seen(8).sum() > 1.2 * seen(5).sum()
 

@@ -137,7 +137,7 @@ def test_what_runs_aside_lets_each_further_frame_pass(made: Made) -> None:
 
         def parts() -> None:
             first.set()
-            networks.lane_head.give_way()
+            networks.lane_head.yield_core()
             second.set()
 
         aside = networks.aside
@@ -160,4 +160,4 @@ def test_at_rate_max_nothing_runs_aside(made: Made) -> None:
     with made(detector, segmenter, 1.0, rate="max") as networks:
         assert networks.aside is None
         networks.start(frame(0))
-        networks.lane_head.give_way()  # at once: lanes are found within the frame
+        networks.lane_head.yield_core()  # at once: lanes are found within the frame

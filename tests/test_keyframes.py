@@ -1,4 +1,4 @@
-"""The unit of length of the window of keyframes: no image says anything of it, so nothing may move it."""
+"""The scale of the window of keyframes: no image says anything of it, so nothing may move it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ POINTS = 700
 def unit_of_length(seed: int, way_m: float, sigma_px: float) -> Floats:
     """Estimated over true length of pieces of a straight street between points at both sides, seen with noise.
 
-    The first two poses are the true ones, and nothing tells the unit of length afterwards.
+    The first two poses are the true ones, and nothing tells the scale afterwards.
     """
     rng = np.random.default_rng(seed)
     side = rng.choice([-1.0, 1.0], POINTS)

@@ -68,7 +68,7 @@ class Elsewhere:
 
 
 class Driver:
-    """Straight on, by so much a frame."""
+    """Straight on, by this amount a frame."""
 
     def __init__(self, head: LaneHead) -> None:
         self.mapper = LaneMapper(CAMERA, StaticMapConfig(), head=head)
@@ -98,10 +98,10 @@ def test_it_gives_way_to_frames_between_its_parts() -> None:
     """One run of all parts is 15 ms of the interpreter that the frames need, too."""
     ways, image = [0], np.full((CAMERA.height_px, CAMERA.width_px), 90, np.uint8)
 
-    def give_way() -> None:
+    def yield_core() -> None:
         ways[0] += 1
 
-    polite, plain = Driver(LaneHead(Counted(), None, 3, give_way=give_way)), Driver(LaneHead(Counted(), None, 3))
+    polite, plain = Driver(LaneHead(Counted(), None, 3, yield_core=yield_core)), Driver(LaneHead(Counted(), None, 3))
     for k in range(7):
         before = ways[0]
         found = [

@@ -302,9 +302,9 @@ def test_a_bump_where_the_window_begins_anew_is_not_a_camera_that_is_mounted_oth
     ]
     _, motions = drive(truth, edit=nothing_to_see)
     learned_rad = next(m for m in motions if m.to_frame == 7).ground.pitch_rad
-    anew = [m for m in motions if m.to_frame >= 23]
+    again = [m for m in motions if m.to_frame >= 23]
     assert Status.ODOMETRY_COASTING in next(m for m in motions if m.to_frame == 22).status  # restarted there
-    assert max(abs(m.ground.pitch_rad - learned_rad) for m in anew) < math.radians(1.0)
+    assert max(abs(m.ground.pitch_rad - learned_rad) for m in again) < math.radians(1.0)
 
 
 def test_vehicles_everywhere_leave_nothing_to_measure() -> None:
@@ -444,14 +444,14 @@ def test_settings_are_typed_and_closed() -> None:
 
 
 class KnownScale(RoadScale):
-    """A unit of length that is known to a percent."""
+    """A scale that is known to a percent."""
 
     sigma_rel = 0.01
 
 
 @pytest.mark.parametrize(("step_m", "sigma_m", "valid"), [(1.0, 0.02, True), (1.0, 0.2, False), (0.02, 0.02, True)])
 def test_a_step_whose_own_length_is_vague_is_not_to_be_driven_by(step_m: float, sigma_m: float, valid: bool) -> None:
-    """However well the unit of length is known: behind heavy rain few corners are the street's."""
+    """However well the scale is known: behind heavy rain few corners are the street's."""
     scale = KnownScale(CAMERA, RoadScaleConfig())
     records = MotionRecords(MotionConfig(), 1.7, scale, MotionModel(), RoadScaleConfig().invalid_sigma_rel)
     cov6 = np.diag([0.001**2, 0.001**2, sigma_m**2, 1e-8, 1e-8, 1e-8])

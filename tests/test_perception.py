@@ -123,7 +123,7 @@ def test_the_input_is_the_manifests_arithmetic(colour: str, layout: str, grey: b
     mean, std = tuple(rng.uniform(-1, 1, 3)), tuple(rng.uniform(0.5, 2, 3))
     entry = square_input(colour=colour, layout=layout, scale=1 / 255, mean=mean, std=std, resize=FitPad(pad_value=7))
     preparation = Preparation(entry)
-    for height_px in (SIZE_PX // 2, SIZE_PX):  # the padding is painted anew where the size changes
+    for height_px in (SIZE_PX // 2, SIZE_PX):  # the padding is painted again where the size changes
         image = rng.integers(0, 256, (height_px, SIZE_PX) if grey else (height_px, SIZE_PX, 3), dtype=np.uint8)
         (view,) = make_views(SIZE_PX, height_px, entry, None)
         preparation.fill(image, view)

@@ -73,7 +73,7 @@ def test_a_reversal_at_33_hz_is_found_within_a_span(speed_mps: float) -> None:
     judged = [gate.admit(m) for m in at_33_hz([speed_mps / 33.0 * (1.0 if k < 20 else -1.0) for k in range(60)])]
     wrong = [m.frame_id for m in judged if Status.MOTION_IMPLAUSIBLE in m.status]
     assert 21 <= wrong[0] <= 24
-    assert any(m.cc is None for m in judged)  # the world begins anew
+    assert any(m.cc is None for m in judged)  # the world restarts
 
 
 def test_a_jump_of_one_motion_at_33_hz_is_found_at_once() -> None:

@@ -48,7 +48,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> tuple[TrackingSequence, l
 
 
 def noisy(sequence: TrackingSequence, log: list[Measurements], times: float) -> list[Measurements]:
-    """Vehicles' edges at the truth but for `times` the noise that they state, anew in each frame; sizes are known."""
+    """Vehicles' edges at the truth but for `times` the noise that they state, again in each frame; sizes are known."""
     rng = np.random.default_rng(1)
     cov = tuple(np.diag(SIGMA**2).ravel().tolist())
     first, out = log[0].frame_id, []

@@ -227,7 +227,7 @@ def test_measurements_that_the_recorder_never_had_end_the_comparison_until_a_new
     tape.take(tape.send(frames[10], recorded=False))
     for measurements in frames[11:20]:
         tape.step(measurements)
-    for measurements in frames[21:]:  # frame 20 never came to the optimizer: it begins anew
+    for measurements in frames[21:]:  # frame 20 never came to the optimizer: it restarts
         tape.step(measurements)
     tape.end(frames[-1])
     verdict = verdict_of(tape)
@@ -246,7 +246,7 @@ def test_a_new_epoch_whose_first_estimate_was_lost_is_no_difference(
     for measurements in frames[:10]:
         tape.step(measurements)
     tape.frame(frames[10])
-    tape.send(frames[10])  # never comes to the optimizer, which begins anew with the next
+    tape.send(frames[10])  # never comes to the optimizer, which restarts with the next
     if restart:
         tape.restart(with_checkpoint=False)
     tape.take(tape.send(frames[11], recorded=missing == "estimate"), recorded=False)
@@ -291,7 +291,7 @@ def test_an_epoch_that_began_in_a_process_killed_before_its_estimates_left(
 
 
 def test_an_estimate_that_cannot_be_compared_is_not_replayed_twice(tmp_path: Path) -> None:
-    """The frame that was coasted over as the world began anew is not in the recording."""
+    """The frame that was coasted over as the world restarted is not in the recording."""
     tape, frames = Tape(tmp_path), measured(40)
     for measurements in frames[:10]:
         tape.step(measurements)

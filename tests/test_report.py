@@ -35,7 +35,7 @@ EVIL = "</script><script>document.title='broken'</script>"
 
 @pytest.fixture
 def results(tmp_path: Path) -> Path:
-    """A drive of 60 frames at 10 Hz and 5 m/s: it begins without a scale, and begins anew at frame 40."""
+    """A drive of 60 frames at 10 Hz and 5 m/s: it begins without a scale, and restarts at frame 40."""
     directory = tmp_path / "drive & <b>way"
     with Recorder(directory, CAMERA) as recorder:
         for k in range(FRAMES):

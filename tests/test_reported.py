@@ -25,7 +25,7 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> TrackingSequence:
 def told(
     sequence: TrackingSequence, frame: int, too_far_rel: float = 0.0, aside_m: float = 0.0, speed_up_mps: float = 0.0
 ) -> Estimate:
-    """An estimate whose vehicles err by so much, in a world that is turned and moved against the first frame's."""
+    """An estimate whose vehicles err by this amount, in a world that is turned and moved against the first frame's."""
     T_world_ego = SE2(40.0, -7.0, 2.0)
     vehicles = []
     for label in sequence.labels_of(frame):

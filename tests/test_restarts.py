@@ -99,7 +99,7 @@ def test_silence_is_no_missed_record() -> None:
     intake = Intake()
     assert not any(intake.missed(5, 5, 0.1, float(second), 1.0) for second in range(100))
     assert intake.missed(5 + MISSED_RECORDS, 5, 0.1, 100.0, 1.0) == MISSED_RECORDS
-    assert intake.missed(2, 5, 0.1, 101.0, 1.0) == 0  # the sender began anew
+    assert intake.missed(2, 5, 0.1, 101.0, 1.0) == 0  # the sender restarted
 
 
 def test_a_loop_that_stands_still_misses_nothing_yet() -> None:

@@ -150,7 +150,7 @@ def test_a_carried_scale_is_known_the_worse_the_longer_it_is_carried() -> None:
 
 
 def pitch_under_drift(config: RoadScaleConfig) -> float:
-    """The pitch (rad) after 100 m of a level road, on which the unit of length shrinks by 0.25 % a metre."""
+    """The pitch (rad) after 100 m of a level road, on which the scale shrinks by 0.25 % a metre."""
     steep = np.array([1.0, 0.2, 0.0, 0.0])  # 8 mrad of pitch for 4 % of length
     cov = np.diag([0.005**2, 1e-4, 1e-4, 1e-7]) + 0.5**2 * np.outer(steep, steep)
     filter_, off_log = RoadFilter(CAMERA, config), 0.0

@@ -194,7 +194,7 @@ def test_a_flat_road_stands_still_behind_an_encoder() -> None:
     assert encoder.code(np.full((64, 128), 200, np.uint8)).mean() > 150.0  # another scene is coded
 
 
-# --- rendered anew ---
+# --- rendered again ---
 
 
 @pytest.mark.slow

@@ -414,7 +414,7 @@ def test_a_peer_learns_no_way_around_the_gate(vehicle: Vehicle, certificates: Pa
 
 @needs_openssl
 def test_noise_and_giants_leave_the_gate_standing(vehicle: Vehicle, certificates: Path) -> None:
-    """Who is in goes on reading meanwhile; who comes anew may knock twice (zenoh pauses after a bad handshake)."""
+    """Who is in goes on reading meanwhile; who comes again may knock twice (zenoh pauses after a bad handshake)."""
     with outside(certificates, vehicle.port) as session:
         silent = [socket.create_connection(("127.0.0.1", vehicle.port)) for _ in range(8)]
         for number in range(20):

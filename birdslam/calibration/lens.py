@@ -94,7 +94,7 @@ def self_calibrate(
 ) -> Lens | None:
     """The lens that the corners of a drive's raw images show; None where there is too little to see.
 
-    `focal_px` with its 1-sigma is what is known beforehand. Where it is `by_view` across the image, nobody knows
+    `focal_px` with its 1-sigma is what is known beforehand. Where it is `by_view` across the image, it is unknown
     whether the view was counted with the lens's distortion or without: the sigma covers both, and how sure the
     distortion is. The focal length trades against turns and lateral motion in a narrow valley: so it is looked for from
     several. `bend`: that of a pinhole by upright lines (uprights.py), with its 1-sigma.
@@ -105,10 +105,10 @@ def self_calibrate(
     middle = 0.5 * (np.array(size_px, dtype=np.float64) - 1.0)
     windows = windows_of(images, middle, focal_px)
     sigma_px = SIGMA_PX * focal_px / FOCAL_PX
-    begun = begin(windows, focal_px, k1_before[0], sigma_px, fisheye, k1_before)
-    if begun is None:
+    started = begin(windows, focal_px, k1_before[0], sigma_px, fisheye, k1_before)
+    if started is None:
         return None
-    fitted = adjust(begun)
+    fitted = adjust(started)
     again = begin(windows, focal_px, fitted.k1, sigma_px, fisheye, k1_before)
     fitted = fitted if again is None else adjust(again)
     prior = FocalPrior(math.log(focal_px), focal_sigma_rel)
@@ -148,8 +148,8 @@ def _turned_rad(problem: LensProblem) -> float:
 
 def _with_focal_length(windows: Sequence[Window], fitted: LensProblem, prior: FocalPrior) -> LensProblem:
     """The problem with the focal length that costs least, of those that are found from several."""
-    begun = (at_focal_length(fitted, prior.log_focal + by * prior.sigma) for by in _BEGUN)
-    found = [adjust(problem, prior, _ROUGHLY) for problem in begun]
+    started = (at_focal_length(fitted, prior.log_focal + by * prior.sigma) for by in _BEGUN)
+    found = [adjust(problem, prior, _ROUGHLY) for problem in started]
     best = min(found, key=lambda problem: cost_of(problem, prior))
     # Which corners are outliers was decided with another lens
     again = begin(windows, math.exp(best.log_focal), best.k1, best.sigma_px, best.fisheye, best.k1_before)

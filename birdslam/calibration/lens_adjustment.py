@@ -235,7 +235,7 @@ def _linearise(problem: LensProblem, prior: FocalPrior | None) -> tuple[float, _
     weighed = J_view * w
     view = _summed_by_window(problem.of, weighed, J_view)
     gradient = _summed_by_window(problem.of, weighed, r)[..., 0]
-    # A window's unit of length is its own: the way to its last image is held where it is
+    # A window's scale is its own: the way to its last image is held where it is
     last = slice(poses - 3, poses)
     for k, way in enumerate(problem.t[:, -1]):
         view[k, last, last] += 1e4 * np.outer(way, way) / float(way @ way)

@@ -172,10 +172,10 @@ def begin(
     R: list[Floats] = []
     t: list[Floats] = []
     for window in windows:
-        begun = _begin_window(_undistorted(window.px, focal_px, k1, fisheye))
-        if begun is None:
+        started = _begin_window(_undistorted(window.px, focal_px, k1, fisheye))
+        if started is None:
             continue
-        keep, R_w, t_w, corner_w = begun
+        keep, R_w, t_w, corner_w = started
         px.append(window.px[:, keep].transpose(1, 0, 2))
         row.append(window.row[:, keep].T)
         t_s.append(window.t_s)

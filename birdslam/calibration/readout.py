@@ -60,11 +60,11 @@ def readout_of_drive(
         for window in near_windows(images, middle, focal_px)
     ]
     k1 = 0.0, max(k1_sigma, MIN_SIGMA_K1)
-    begun = begin(windows, focal_px, 0.0, SIGMA_PX * focal_px / FOCAL_PX, False, k1, (0.0, _FREE_S))
-    if begun is None:
+    started = begin(windows, focal_px, 0.0, SIGMA_PX * focal_px / FOCAL_PX, False, k1, (0.0, _FREE_S))
+    if started is None:
         return USUAL
     prior = FocalPrior(math.log(focal_px), max(focal_sigma_rel, _MIN_FOCAL_REL, HELD))
-    fitted = adjust(begun, prior)
+    fitted = adjust(started, prior)
     by_drive, sigma_s = fitted.readout_s, float(sigmas_of(fitted, prior)[2])
     if not (math.isfinite(by_drive) and sigma_s < _FREE_S):
         return USUAL

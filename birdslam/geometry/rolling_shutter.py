@@ -41,7 +41,7 @@ class RollingShutter:
     def at_middle(self, xy: Floats, inverse_depth: Floats, rate: Rate) -> Floats:
         """(N, 2) where points seen at `xy` (N, 2) were when the middle row was read; the camera moves at `rate`.
 
-        `inverse_depth` (N,) is theirs as seen, in the rate's unit of length.
+        `inverse_depth` (N,) is theirs as seen, in the rate's scale.
         """
         late_s = self.readout_s * self.row(*self._camera.to_px(xy).T)
         return _moved(xy, inverse_depth, rate, late_s)

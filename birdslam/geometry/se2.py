@@ -62,7 +62,7 @@ class SE2(msgspec.Struct, frozen=True, array_like=True, gc=False):
         return SE2(-c * self.x_m - s * self.y_m, s * self.x_m - c * self.y_m, wrap(-self.yaw_rad))
 
     def scaled(self, factor: float) -> SE2:
-        """The same in another unit of length: `factor` of the new unit is one of the old."""
+        """The same in another scale: `factor` of the new unit is one of the old."""
         return SE2(factor * self.x_m, factor * self.y_m, self.yaw_rad)
 
     def between(self, other: SE2) -> SE2:

@@ -47,7 +47,7 @@ class Checkpoint(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     settings: dict[str, Any]  # what it was made with, plain
     epoch: int
-    begun: Epoch | None
+    started: Epoch | None
     pending: PendingState
 
 

@@ -31,7 +31,7 @@ class GraphConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     forget_s: Positive = 1.0  # a vehicle out of sight is predicted on for so long
     max_vehicles: Count = 32  # the longest out of sight go first
     detection_gate_sigma: Positive = 4.0  # Mahalanobis distance past which a detection weighs less; twice it: nothing
-    detection_contradictions: Count = 5  # so many left out in a row begin the vehicle anew
+    detection_contradictions: Count = 5  # so many left out in a row begin the vehicle again
     # Whether what is seen of vehicles corrects the ego, too. False: they are placed with all of the ego's uncertainty,
     # and leave it where odometry and landmarks put it. Their errors last (size, yaw), which no edge says
     vehicles_move_ego: bool = False

@@ -46,7 +46,7 @@ def vehicle_estimates(
 ) -> tuple[VehicleEstimate, ...]:
     """Every vehicle at source time `t_ns`; one whose newest pose is older is driven on with the twist it had.
 
-    `changes` (3,): the variances of a twist grow by so much a second. `ego_mps` is the ego's velocity in its own axes.
+    `changes` (3,): growth of a twist's variances per second. `ego_mps` is the ego's velocity in its own axes.
     `birth_det`: the determinant of a velocity's covariance at birth, to judge by whether a vehicle stands
     (standing.py); None: nobody judges.
     """
@@ -122,7 +122,7 @@ def marginals_in_world(
     window: Window, ahead_s: Floats, changes: Triple
 ) -> tuple[Complexes, Complexes, Complexes, Floats]:
     """Vehicles in world, driven on by `ahead_s` (M,) past their newest pose: places, headings and velocities (M,) in
-    m/s, and the covariances (M, 5, 5) of pose and velocity. `changes` (3,): twists' variances grow by so much a second.
+    m/s, and the covariances (M, 5, 5) of pose and velocity. `changes` (3,): growth of the twists' variances per second.
     """
     ego, origin, n = cmath.rect(1.0, window.world.yaw_rad), complex(window.world.x_m, window.world.y_m), window.nodes
     at, heading, velocities = window.at[n:], window.heading[n:], window.velocity

@@ -113,7 +113,7 @@ class PoseGraph:
         for factor in self._concluding:
             factor.conclude(frame, window)
         self._map.add(m.frame_id, frame.settled, window.world, m.lanes)
-        if not window.is_finite:  # numbers that no road has: begin anew rather than publish them
+        if not window.is_finite:  # numbers that no road has: restart rather than publish them
             window, reset = self._begin(m, True), True
         status = (*m.status, Status.GRAPH_RESET) if reset else m.status
         self._people = m.people
@@ -148,9 +148,9 @@ class PoseGraph:
 
     def checkpoint(self) -> bytes:
         """The graph as it stands between two frames, for `restore`."""
-        begun = None
+        started = None
         if self.window is not None:
-            begun = Epoch(
+            started = Epoch(
                 window=self.window.state(),
                 vehicles=self._vehicles.nodes,
                 factors={f.name: packed(f.state()) for f in self.factors if f.state_type is not None},
@@ -160,7 +160,7 @@ class PoseGraph:
                 people=list(self._people),
                 traffic=self._traffic.state(),
             )
-        return pack(Checkpoint(settings=self.settings, epoch=self.epoch, begun=begun, pending=self._map.state()))
+        return pack(Checkpoint(settings=self.settings, epoch=self.epoch, started=started, pending=self._map.state()))
 
     @property
     def settings(self) -> dict[str, object]:
@@ -177,26 +177,26 @@ class PoseGraph:
         """
         graph = PoseGraph(config, weights, factors=factors)
         checkpoint = unpack(data, graph.settings)
-        graph.epoch, begun = checkpoint.epoch, checkpoint.begun
+        graph.epoch, started = checkpoint.epoch, checkpoint.started
         graph._map.resume(checkpoint.pending, checkpoint.epoch)
-        if begun is None:
+        if started is None:
             return graph
         try:
-            graph.window = Window.from_state(begun.window, graph._together)
+            graph.window = Window.from_state(started.window, graph._together)
             for factor in graph.factors:
                 if factor.state_type is not None:
-                    factor.resume(unpacked(begun.factors.get(factor.name, b""), factor.state_type))
+                    factor.resume(unpacked(started.factors.get(factor.name, b""), factor.state_type))
         except CheckpointError:
             raise
         except ValueError as error:
             raise CheckpointError(f"does not fit together: {error}") from None
-        if len(begun.vehicles) != len(graph.window.velocity):
-            raise CheckpointError(f"does not fit together: {len(begun.vehicles)} vehicles are not the window's")
+        if len(started.vehicles) != len(graph.window.velocity):
+            raise CheckpointError(f"does not fit together: {len(started.vehicles)} vehicles are not the window's")
         graph._vehicles = VehicleNodes(config.forget_s, config.max_vehicles, config.detection_contradictions)
-        graph._vehicles.resume(begun.vehicles)
-        graph._t_ns, graph._t_before_ns, graph._motion = begun.t_ns, begun.t_before_ns, begun.motion
-        graph._people = tuple(begun.people)
-        graph._traffic = Traffic(begun.traffic)
+        graph._vehicles.resume(started.vehicles)
+        graph._t_ns, graph._t_before_ns, graph._motion = started.t_ns, started.t_before_ns, started.motion
+        graph._people = tuple(started.people)
+        graph._traffic = Traffic(started.traffic)
         return graph
 
     def _begin(self, m: Measurements, reset: bool) -> Window:
@@ -255,12 +255,12 @@ class PoseGraph:
         """Forgets who is long out of sight, and begins who is new or was an outlier too often."""
         m, cv, known = frame.measurements, frame.edges.cv, frame.associations.known
         outliers = [known[i] for i in self.outliers.get(VehicleDetections.name, ())]
-        rows, begun = self._vehicles.update(cv, known, outliers, m.t_source_ns)
+        rows, started = self._vehicles.update(cv, known, outliers, m.t_source_ns)
         if rows is not None:
             window.select(rows)
-        if begun:
-            begins = [self._vehicles.begin(cv[k].vehicle, m.frame_id, m.t_source_ns) for k in begun]
-            seen = cv_edges(begins, frame.edges.cv_numbers[begun])
+        if started:
+            begins = [self._vehicles.begin(cv[k].vehicle, m.frame_id, m.t_source_ns) for k in started]
+            seen = cv_edges(begins, frame.edges.cv_numbers[started])
             factors = sight_factors(seen.at, seen.covs)
             lasting, sigma_rel = math.sqrt(self.config.lasting_share) * factors, relative_sigmas(seen, factors)
             window.place_vehicles(seen, self._birth_covs(seen.covs[:, 2, 2]), lasting, sigma_rel)

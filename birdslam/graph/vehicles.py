@@ -128,7 +128,7 @@ class VehicleNodes:
         soon ends.
         """
         born = []
-        begun = [k for k in range(len(edges)) if k not in known] if len(known) < len(edges) else []
+        started = [k for k in range(len(edges)) if k not in known] if len(known) < len(edges) else []
         for k, edge in enumerate(edges):
             row = self._row.get(edge.vehicle)
             if row is None:
@@ -140,7 +140,7 @@ class VehicleNodes:
             else:
                 v.contradicted += 1
                 if v.contradicted >= min(v.agreed, self._contradictions):
-                    begun.append(k)
+                    started.append(k)
             v.seen_ns, v.frames, v.label = t_ns, v.frames + 1, edge.label
             v.length_m, v.width_m, v.delay_ns = edge.length_m, edge.width_m, edge.delay_ns
             v.standing_seen = edge.standing or None  # 0: nobody said
@@ -152,15 +152,15 @@ class VehicleNodes:
         before = len(self.nodes)
         alive = [row for row, v in enumerate(self.nodes) if (t_ns - v.seen_ns) * 1e-9 <= self._forget_s]
         if not born and len(alive) == before:
-            return None, begun
+            return None, started
         everyone = [*self.nodes, *born]
         rows = [*alive, *range(before, len(everyone))]
         if len(rows) > self._capacity:  # the freshest stay, the first of them first
             rows = sorted(sorted(rows, key=lambda row: (-everyone[row].seen_ns, row))[: self._capacity])
         self.nodes = [everyone[row] for row in rows]
         self._row = {v.vehicle: row for row, v in enumerate(self.nodes)}
-        begun = [k for k in begun if edges[k].vehicle in self._row]
-        return [row if row < before else -1 for row in rows], begun
+        started = [k for k in started if edges[k].vehicle in self._row]
+        return [row if row < before else -1 for row in rows], started
 
     def begin(self, vehicle: int, frame: int, t_ns: int) -> int:
         """The row of a vehicle whose first pose is in this frame."""

@@ -314,7 +314,7 @@ class Window:
     # --- vehicles come and go ---
 
     def place_vehicles(self, seen: CvEdges, twist_covs: Floats, lasting: Floats, sigma_rel: Floats) -> None:
-        """Vehicles begin anew where they are seen, at rest give or take, independent of all else.
+        """Vehicles restart where they are seen, at rest give or take, independent of all else.
 
         `lasting` (k, 2, 2) and `sigma_rel` (k, 2) are of their edges; see lasting_error.py.
         """

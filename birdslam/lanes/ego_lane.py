@@ -15,7 +15,7 @@ from birdslam.types import Bound, Lane, LaneChange, LaneLine, Lanes, LineKind
 CROSSED_M = 0.3  # past the line the ego has changed lanes
 WIDTH_GAIN = 0.05  # of a frame's width, in the running mean
 LEVEL = Tilt()
-MIN_SIGMA_M = 0.15  # lanes of one road differ by so much
+MIN_SIGMA_M = 0.15  # lanes of one road differ by this amount
 
 
 class EgoLane:

@@ -70,7 +70,7 @@ class Tilt:
     the road's height over it is v x (x - PLANE_AT_M) / 2: the pitch and the vertical curvature v hardly mix.
     """
 
-    pitch_rad: float = 0.0  # the camera's nose is lower by so much against the road at PLANE_AT_M
+    pitch_rad: float = 0.0  # the camera's nose is lower by this amount against the road at PLANE_AT_M
     vertical_per_m: float = 0.0  # vertical curvature; > 0: the road rises ahead
 
     @property

@@ -39,7 +39,7 @@ SAME_M = 0.3  # two lines nearer than this along all of 5 to 20 m are one
 FORGOTTEN_M = -2.0  # a line that ended so far behind the ego is dropped
 NEAR_M, FAR_M = 5.0, 25.0  # where a line that is there has to be seen
 # Two lines nearer than this anywhere there bound no lane: one whose paint an image lacks gives way to one whose paint
-# it has, so many times as fast as where it is alone
+# it has, this factor faster as where it is alone
 NARROW_M, GIVES_WAY = 1.5, 3.0
 PAST_EDGE_M, MAX_ROAD_PAST = 0.8, 0.35  # so far past an edge there is no road along so much of it
 MIN_EXISTENCE, LOOKS_OF_A_SCRAP = 0.4, 4.0  # what has less after so many images is dropped
@@ -53,14 +53,14 @@ class LineTracker:
     """State: the filter, in the ego's frame at `T_world_filter`, and its lines' tracks."""
 
     def __init__(
-        self, camera: Camera, certain_m: float = CERTAIN_M, give_way: Callable[[], object] = lambda: None
+        self, camera: Camera, certain_m: float = CERTAIN_M, yield_core: Callable[[], object] = lambda: None
     ) -> None:
         """`certain_m` metres of evidence make a line sure in its first image.
 
-        `give_way` is called between the parts of an update (lane_mapper.LaneHead).
+        `yield_core` is called between the parts of an update (lane_mapper.LaneHead).
         """
         self.camera = camera
-        self._give_way = give_way
+        self._yield_core = yield_core
         self._certain_m = certain_m
         self._next = 0
         self.clear()
@@ -99,9 +99,9 @@ class LineTracker:
             return
         view = road_view(self.camera, ground, image, segmentation, boxes_px, bonnet_px)
         self._road_from_m = nearest_m(self.camera, ground, bonnet_px)
-        self._give_way()
+        self._yield_core()
         paint = paint_points(view)
-        self._give_way()
+        self._yield_core()
         first_tilt_rad = 0.0
         if not len(self._filter):
             shape, found = self._search(view, paint, sigma_pitch_rad if search_tilt else 0.0)
@@ -110,7 +110,7 @@ class LineTracker:
             return
         points, of, seen = self._correct(view, paint, sigma_pitch_rad, travelled_m, first_tilt_rad, search_tilt)
         if self._is_lost(view, paint, seen):
-            self._give_way()
+            self._yield_core()
             shape, found = self._search(view, paint, 0.0)
             before = _explained_m(paint, self._tracks, seen)
             if sum(peak.evidence_m for kind, peak in found if kind == PAINT) > BETTER * before:
@@ -119,7 +119,7 @@ class LineTracker:
         if not self._filter.sound().all():
             self._keep_sound()
             return
-        self._give_way()
+        self._yield_core()
         self._judge(view, points, seen)
         self._add_lines(points, of, seen, ground.height_m)
         self._drop_lines()

@@ -23,11 +23,11 @@ AGAINST = -0.3  # cosine of a direction to the ego's, below which traffic comes 
 EVIDENCE = 2.0  # log odds that one vehicle adds: one in eight turns, overtakes or is misjudged
 MAX_LOG_ODDS = 6.0  # log odds
 # Log odds that one vehicle adds to whether those beyond a line drive, and their most: kerbs and lanes are side by side,
-# and who is so much farther aside than the other is told about less
+# and the evidence falls with the lateral distance beyond the other lane
 DRIVES_EVIDENCE, DRIVES_MAX = 1.0, 3.0
 ALIKE_M, MIN_ALIKE = 1.5, 0.3
 MIN_SIGMA_MPS, MAX_SIGMAS = 0.1, 30.0
-# Where the ego drives fast nobody parks: log odds that each m/s beyond PARKED_MPS adds to who drives, and their most.
+# Vehicles do not park on fast roads: log odds of driving per m/s beyond PARKED_MPS, and their maximum.
 # Of KITTI tracking's cars beside the ego's lane, each once, 0.58 stand below 14 m/s (of 317; 0.45 to 0.61 with one
 # sequence left out) and 0.34 beyond (of 71; 0.26 to 0.39)
 PARKED_MPS, PARKED_EVIDENCE, PARKED_MAX = 13.0, 0.4, 3.0
@@ -113,7 +113,7 @@ class Traffic:
             self._against[line] = min(max(odds, -MAX_LOG_ODDS), MAX_LOG_ODDS)
             _forget(self._counted)
             _forget(self._against)
-        # Who drives along at the ego's left may do so in a lane of its own way
+        # A vehicle to the left of the ego that drives along may be in a lane of the same direction
         if against and vehicle not in self._sided:
             self._sided[vehicle] = None
             evidence = math.log(FAR_SIDE[0] / NEAR_SIDE[0])

@@ -38,7 +38,7 @@ class UserInEgo:
 
     @property
     def surely_drives(self) -> bool | None:
-        """Whether it drives, where that is sure; None: nobody knows yet."""
+        """Whether it drives; None while this is undecided."""
         if abs(self.speed_mps) >= max(DRIVES_MPS, MOVES_SIGMAS * self.speed_sigma_mps):
             return True
         return False if self.standing >= STANDS else None
@@ -47,7 +47,7 @@ class UserInEgo:
     def cos_along(self) -> float | None:
         """Cosine of the angle between its direction and the ego's; None where it is not known.
 
-        A box has the same shape from behind, so only who drives forward along its yaw has a known direction: a new
+        A box looks the same from behind, so only a vehicle driving forward along its yaw has a known direction: a new
         vehicle that seems to drive fast backwards has the wrong yaw or the wrong speed.
         """
         least_mps = max(DRIVES_MPS, MOVES_SIGMAS * self.speed_sigma_mps)

@@ -14,7 +14,7 @@ from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.types import NS_PER_S, Estimate
 
-LOST_SIGMA_M, LOST_SIGMA_RAD = 0.5, math.radians(1.5)  # a pose less exact than that is none
+LOST_SIGMA_M, LOST_SIGMA_RAD = 0.5, math.radians(1.5)  # beyond it a pose counts as lost
 # Odometry between fixes, 1-sigma: along and across as a share of the way, yaw by the root of it
 DRIFT_REL, DRIFT_M, DRIFT_YAW_RAD = 0.02, 0.01, 0.0012
 INVALID_REL, INVALID_YAW_RAD_PER_M = 1.0, 0.02  # of a step that odometry itself calls invalid: any length, any bend

@@ -27,7 +27,7 @@ RARE_M = 4.0  # of way, from one look-up among all places to the next, for who i
 FOUND_INLIERS, FOUND_PLACES = 25, 7  # of a frame that nothing was known of
 FOUND_SHARE = 0.3  # of its matches that must fit
 KEPT_INLIERS, KEPT_PLACES = 18, 6  # of a frame that was foreseen
-AMPLE_INLIERS = 40  # with fewer, farther keyframes are looked at too
+ENOUGH_INLIERS = 40  # with fewer, farther keyframes are looked at too
 CONFIRMATIONS = 2  # further frames that must say the same
 KIDNAPPED_CONFIRMATIONS = 12  # where odometry since the last fix contradicts them: it was cut, or the place is another
 HYPOTHESES = 4
@@ -130,7 +130,7 @@ class Localiser:
         self.map_epoch += 1
 
     def lose(self) -> None:
-        """Odometry began anew: nothing is known any more."""
+        """Odometry restarted: nothing is known any more."""
         self._T_map_ego, self._T_odom_ego = None, None
         self.steps = Steps()
         self._hypotheses.clear()
@@ -182,7 +182,7 @@ class Localiser:
         for far in (False, True):
             found = locate(self._camera, features, self.map.around(rows[0], among, far), T_keyframe_ego, radius_px)
             fix = found if fix is None or (found is not None and found.inliers > fix.inliers) else fix
-            if fix is not None and fix.inliers >= AMPLE_INLIERS:
+            if fix is not None and fix.inliers >= ENOUGH_INLIERS:
                 break
         if fix is None or fix.inliers < KEPT_INLIERS or fix.places < KEPT_PLACES:
             return None

@@ -137,7 +137,7 @@ def decode_map(data: bytes) -> PlaceMap:
     version, length, crc = HEAD.unpack(data[len(MAGIC) : head])
     if version not in READ:
         reads = " and ".join(map(str, READ))
-        raise MapError(f"is of version {version}, and this BirdSLAM reads versions {reads}: drive it anew")
+        raise MapError(f"is of version {version}, and this BirdSLAM reads versions {reads}: drive it again")
     if length > MAX_BYTES:
         raise MapError(f"says that it has {length} bytes: more than {MAX_BYTES}")
     if len(data) - head != length:
@@ -275,5 +275,5 @@ def _cov(cov: np.ndarray) -> tuple[float, ...]:
 
 def _matrix(cov: tuple[float, ...]) -> np.ndarray:
     if not math.isfinite(sum(cov)) or min(cov[::4]) < 0.0:
-        raise MapError("has a covariance that is none")
+        raise MapError("has an invalid covariance")
     return np.array(cov).reshape(3, 3)

@@ -49,7 +49,7 @@ class MapPose(msgspec.Struct, frozen=True, kw_only=True):
     t_utc_ns: int
     epoch: int  # of the estimates that T_map_odom takes into the map
     state: MapState
-    map_epoch: int = 0  # rises where T_map_odom jumped: a place was recognised anew, or a loop was closed
+    map_epoch: int = 0  # rises where T_map_odom jumped: a place was recognised again, or a loop was closed
     T_map_odom: SE2 | None = None  # none where lost
     T_odom_ego: SE2 | None = None  # the estimate's T_world_ego, at which cov holds
     cov: Cov3 | None = None  # of T_map_odom @ T_odom_ego, of the tangent at that pose; none where lost
@@ -69,7 +69,7 @@ class InMap:
     pose: MapPose | None  # by which it was brought there; none: the map process never said one
 
 
-STALE_NS = NS_PER_S  # of an older pose nobody knows what odometry has been through since
+STALE_NS = NS_PER_S  # an older pose may be followed by unknown motion
 
 NOWHERE = InMap(MapState.LOST, None, np.full((3, 3), np.inf), 0, None)
 

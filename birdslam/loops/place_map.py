@@ -107,7 +107,7 @@ class PlaceMap:
         return float(sum(math.hypot(link.T_from_to.x_m, link.T_from_to.y_m) for link in self.links if not link.loop))
 
     def add(self, keyframe: Keyframe) -> None:
-        """A further keyframe; it can be found soon. Words are learned anew whenever the map wants twice as many."""
+        """A further keyframe; it can be found soon. Words are learned again whenever the map wants twice as many."""
         self.keyframes.append(keyframe)
         self._descriptors += len(keyframe.descriptors)
         if self.words is not None and words_for(self._descriptors) >= 2 * len(self.words):
@@ -152,7 +152,7 @@ class PlaceMap:
         return self._index
 
     def learn(self) -> None:
-        """Words anew from what the map holds now."""
+        """Words again from what the map holds now."""
         self.words, self._index = None, None
         self.index()
 

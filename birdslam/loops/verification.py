@@ -44,7 +44,7 @@ NARROWEST = 9.0  # its width at the end, as a chi-square
 # For residuals as foreseen the weighed mean of chi-square is 1.49, and the covariance .81 of the weighed system's (the
 # asymptotic variance of an M-estimator, Huber 1981); of larger ones both grow
 MEAN_CHI2, EFFICIENCY = 1.4911, 0.8105
-OTHER_VIEW_PX = 1.0  # 1-sigma of a corner found anew from another place and at another time, besides its own noise
+OTHER_VIEW_PX = 1.0  # 1-sigma of a corner found again from another place and at another time, besides its own noise
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,7 +30,7 @@ _MIN_S = 1e-6
 
 
 class ExternalConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The uncertainty of a trajectory that states none; by judgement, chosen on no data."""
+    """The uncertainty of a trajectory that states none; by judgement."""
 
     ego: bool = False  # the poses are of the ego on the road, x forward (as ours); False: of the camera, z forward
     sigma_scale_rel: NotNegative = 0.02  # 1-sigma of its metres: of each metre that it goes, along the way
@@ -39,7 +39,7 @@ class ExternalConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sigma_turn_rel: NotNegative = 0.01  # and of the turn, as a fraction
     sigma_floor_m: Positive = 0.002  # of a motion, at the least
     longest_gap_s: Positive = 0.25  # between two poses that are interpolated
-    longest_coast_s: Positive = 2.0  # without a pose; after that the world begins anew
+    longest_coast_s: Positive = 2.0  # without a pose; after that the world restarts
     sigma_pitch_rad: Positive = 0.006  # of the road against the calibrated plane
 
 

@@ -39,7 +39,7 @@ class RoadView:
 
 
 class MetricScale(Protocol):
-    """Turns the odometry's unit of length into metres, image by image."""
+    """Turns the odometry's scale into metres, image by image."""
 
     fit: RoadFit | None  # of the newest image's alignment without its prior, where it was accepted
     vanishing_point: VanishingPoint | None  # of the newest image, where it was accepted
@@ -65,10 +65,10 @@ class MetricScale(Protocol):
         """Too vague to be driven by."""
 
     def restart(self, grey: NDArray[np.uint8], pose: Pose, sigma_rel: float) -> None:
-        """The window begins anew with this image; its unit of length is known to `sigma_rel`."""
+        """The window restarts with this image; its scale is known to `sigma_rel`."""
 
     def speed_predicted(self, sigma_rel: float) -> None:
-        """The newest motion's length comes from the velocity prior, so the unit of length is known to `sigma_rel`."""
+        """The newest motion's length comes from the velocity prior, so the scale is known to `sigma_rel`."""
 
     def lose_tilt(self) -> None:
         """The camera turned without being seen: its tilt is known no better than by the mount."""

@@ -26,7 +26,7 @@ _UNEVEN_ROWS = 0.08  # of the image: how far the corners that tell a turn lie fr
 class MotionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The uncertainty of a motion: measured, stationary, or coasting."""
 
-    # Chosen on KITTI 00, 01, 06, tracking 0005, the raw clip and the shipped drive together, at the truth's own noise:
+    # Tuned on KITTI 00, 01, 06, tracking 0005, the raw clip and the shipped drive together, at the truth's own noise:
     # the mean NEES of one motion is 0.5 to 1.9 on each. Chosen without one of them, that one has 0.6 to 1.2, but 00 2.3
     covariance_inflation: Positive = 4.0  # of variances: tracks of neighbouring corners err together
     # ... by night, when corners lie on the glow of lamps and in the light that moves along with the car: two rendered
@@ -108,7 +108,7 @@ def step_cov(config: MotionConfig, info: Floats) -> Floats:
 
 
 def uneven_cov(cov6: Floats, readout_s: float, change_radps: Floats) -> Floats:
-    """(6, 6) of a camera's step whose rows are read over `readout_s`, while its turn changes by so much (3,) a second.
+    """(6, 6) of a camera's step whose rows are read over `readout_s`, for a change (3,) of its turn rate per second.
 
     Rows are undone by the last turn, a constant one; by how much a mount that trembles turns in each row no image says.
     """

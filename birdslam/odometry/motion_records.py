@@ -59,7 +59,7 @@ class MotionRecords:
         return self._record(frames, step, T_prev_curr, cov, status)
 
     def _is_vague(self, step: Pose, cov6: Floats, dt_s: float) -> bool:
-        """Whether the corners leave the step's own length unknown, however well the unit of length is known."""
+        """Whether the corners leave the step's own length unknown, however well the scale is known."""
         length_m = float(np.linalg.norm(step.p))
         along = step.p / max(length_m, 1e-9)
         sigma_m = math.sqrt(float(along @ cov6[:3, :3] @ along))

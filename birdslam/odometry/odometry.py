@@ -210,7 +210,7 @@ class Odometry:
         if located is None or slips:
             motion = self._coast(frame_id, dt_s, [Status.LOW_TEXTURE], car)
             if slips or dt_s > cfg.max_coast_s or len(corners.displacement_px) < cfg.min_fitting:
-                # Nothing links this image to the reference any more: the window begins anew at the coasted pose.
+                # Nothing links this image to the reference any more: the window restarts at the coasted pose.
                 self._start_window(tracks, frame_id, t_source_ns, boxes_px)
                 self._scale.lose_tilt()
             return motion
@@ -226,7 +226,7 @@ class Odometry:
             if vague and not self._velocity_prior.active:
                 # What the window has was placed by a speed that was hardly known
                 pose, info = self._two_view_pose(corners, dt_s, car) or (pose, info)
-            # Held steps err together, which is the unit of length: one beside another they are known better
+            # Held steps err together, which is the scale: one beside another they are known better
             held_m = min(predicted_sigma_m, _HELD_SIGMA_REL * float(np.linalg.norm(pose.p - self._pose.p)))
             self._window.extend(
                 frame_id, pose, corners.ids, corners.xy, held_m if np.isfinite(predicted_sigma_m) else np.inf
@@ -284,7 +284,7 @@ class Odometry:
         return corners, located if located is not None else self._two_view_pose(corners, dt_s, car)
 
     def _two_view_pose(self, corners: Corners, dt_s: float, car: CarMotion | None) -> PoseEstimate | None:
-        """Starts the window anew from the reference image and this one."""
+        """Starts the window again from the reference image and this one."""
         cfg, reference = self.config, self._tracker.reference
         a, b = match_ids(reference.ids, corners.ids)
         if len(a) < cfg.min_fitting:
@@ -366,7 +366,7 @@ class Odometry:
     def _hold(
         self, tracks: Tracks, frame_id: int, t_source_ns: int, boxes_px: Floats, dt_s: float, car: CarMotion | None
     ) -> Motion:
-        """The speed is held: what has not moved may be on the glass. After a while the window begins anew."""
+        """The speed is held: what has not moved may be on the glass. After a while the window restarts."""
         obstructed = self._selector.obstructed or self._standing.near_road.contradicted
         motion = self._coast(frame_id, dt_s, [Status.VIEW_OBSTRUCTED] * obstructed, car)
         if self._standing.held_too_long(dt_s):

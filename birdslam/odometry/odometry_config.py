@@ -32,7 +32,7 @@ class OdometryConfig(KeyframeConfig, frozen=True, forbid_unknown_fields=True):
     min_fitting: Count = 18  # inliers among the landmarks, for a pose to count as measured
     min_fitting_fraction: Positive = 0.35  # and their ratio to the landmarks in sight
     max_speed_mps: Positive = 70.0  # a faster motion is no measurement
-    max_coast_s: Positive = 1.0  # after that the window begins anew
+    max_coast_s: Positive = 1.0  # after that the window restarts
     zero_velocity: ZeroVelocityConfig = ZeroVelocityConfig()
     fixed_corners: FixedCornersConfig = FixedCornersConfig()
     constant_velocity: ConstantVelocityConfig = ConstantVelocityConfig()

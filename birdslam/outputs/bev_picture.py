@@ -143,7 +143,7 @@ def _extent(scene: Scene, tracks: list[Track]) -> tuple[float, float, float, flo
 
 
 def number_of(vehicle: int) -> int:
-    """As pictures show it: people's numbers begin anew."""
+    """As pictures show it: people's numbers restart."""
     return vehicle & (FIRST_PERSON - 1)
 
 

@@ -24,7 +24,7 @@ PERSON, BICYCLE, MOTORCYCLE = "person", "bicycle", "motorcycle"  # labels of det
 CARS = ("car", "van", "truck", "bus", "trailer")
 RIDER_COLUMNS = 0.5  # of the narrower of two boxes, that a rider and what is ridden share
 RIDER_FEET = 0.35  # of the bicycle's height: from its lower edge up to the feet of its rider, at the most
-RIDER_SIZES = (0.8, 2.6)  # a rider's box is so many times as high as the bicycle's
+RIDER_SIZES = (0.8, 2.6)  # height of a rider's box over the bicycle's
 RIDER_INSIDE, SAME_RIDER_IOU = 0.8, 0.5  # a rider's box lies so far in the cyclist's, and overlaps it so much
 OCCUPANT_INSIDE = 0.9  # of a person's box, inside that of a vehicle whose wheels are lower: somebody in it
 SAME_PERSON_IOU = 0.7  # of two boxes: the better score stays
@@ -155,7 +155,7 @@ def _without_copies(boxes: Floats) -> Floats:
 
 
 def _copies(people: Floats, cyclists: Floats) -> Bools:
-    """(N,): whose box is that of a cyclist's rider; who stands before one has feet or a side of its own."""
+    """Returns (N,) bool: whether a box is that of a cyclist's rider, and not of a person in front of a cyclist."""
     if not len(people) or not len(cyclists):
         return np.zeros(len(people), dtype=np.bool_)
     p, c = people[:, None, :4], cyclists[None, :, :4]

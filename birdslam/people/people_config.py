@@ -72,7 +72,7 @@ class PeopleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     moves_for_s: float = 10.0  # until a stop
     crossing: float = 0.3  # of those who move
     turns_after_s: float = 10.0  # from one way of moving to another
-    stop_mps: float = 0.08  # 1-sigma of the velocity of who stands: they sway
+    stop_mps: float = 0.08  # 1-sigma of the velocity of a standing person, who sways
     sigma_tilt_rad: float = 0.008  # of the road at somebody against the ego's, beside the front end's own sigma
     sigma_common_tilt_rad: float = 0.004  # of the road under all people against the front end's, beside its own sigma
     tilt_memory_s: float = 5.0  # of driving: how long that lasts

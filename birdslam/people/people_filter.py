@@ -247,7 +247,7 @@ class PeopleFilter:
         return Moments(mean, cov, standing, self._weight[:, CHILD_FILTERS].sum(axis=1))
 
     def share(self) -> None:
-        """What each shares with all others is known anew, and replaces what was known before.
+        """What each shares with all others is known again, and replaces what was known before.
 
         Each filter has the old prior in it as information of rank one, in whose place the new one comes. That of the
         tilt is forgotten as the ego drives, and predict() draws the tilt to the new one.

@@ -11,7 +11,7 @@ from birdslam.people.people_tracker import PeopleTracker
 from birdslam.types import FollowedPerson, Moves
 from birdslam.vehicles.track import EgoFrame
 
-KNOWN_FRAMES = 4  # from so many on it is said who stands
+KNOWN_FRAMES = 4  # frames before a person is reported as standing
 
 
 def followed_people(tracker: PeopleTracker, present: EgoFrame) -> tuple[FollowedPerson, ...]:

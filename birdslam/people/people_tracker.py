@@ -191,7 +191,7 @@ class PeopleTracker:
         ]  # fmt: skip
 
     def _conclude(self, frame: OpenFrame) -> None:
-        """Forgets who is gone, gives ids, and decides who stands."""
+        """Removes lost tracks, assigns ids, decides which are standing."""
         if not self.tracks:
             return
         ego, moments = frame.ego, self.filter.moments()

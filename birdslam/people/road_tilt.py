@@ -55,20 +55,20 @@ class SharedRoad:
         self._x = np.zeros(2)
         self._P = np.diag([config.sigma_common_tilt_rad**2, config.sigma_common_rel**2 + config.sigma_pavement_rel**2])
         self._known = False
-        self._told, self._boxes = np.zeros((0, 3, 3)), np.zeros(0)
+        self._reported, self._boxes = np.zeros((0, 3, 3)), np.zeros(0)
 
     def begin(self, count: int) -> None:
         """People seen for the first time, in rows after the others."""
-        self._told = np.concatenate([self._told, np.zeros((count, 3, 3))])
+        self._reported = np.concatenate([self._reported, np.zeros((count, 3, 3))])
         self._boxes = np.append(self._boxes, np.zeros(count))
 
     def keep_rows(self, rows: Sequence[int], leaving: Sequence[int]) -> None:
         """Forgets all others; of those in the rows `leaving` what they told stays."""
         if len(leaving):
-            told, prior = self._samples()[leaving].sum(axis=0), np.linalg.inv(self._P)
-            P = np.linalg.inv(told[_SHARED, _SHARED] + prior)
-            self._x, self._P, self._known = P @ (told[_SHARED, _TILT] + prior @ self._x), P, True
-        self._told, self._boxes = self._told[rows], self._boxes[rows]
+            reported, prior = self._samples()[leaving].sum(axis=0), np.linalg.inv(self._P)
+            P = np.linalg.inv(reported[_SHARED, _SHARED] + prior)
+            self._x, self._P, self._known = P @ (reported[_SHARED, _TILT] + prior @ self._x), P, True
+        self._reported, self._boxes = self._reported[rows], self._boxes[rows]
 
     def predict(self, keep: float, shift_rad: float, sigma_pitch_rad: float) -> None:
         """To the next frame: `keep` of the tilt lasts; the front end's ground, known to `sigma_pitch_rad`, got
@@ -80,12 +80,12 @@ class SharedRoad:
         self._P[_T, _T] = self._P[_T, _T] + (1.0 - keep**2) * prior_var if self._known else prior_var
         M = np.eye(3)
         M[_TILT, _T] = -shift_rad
-        self._told, self._boxes = keep * (M @ self._told @ M.T), keep * self._boxes
+        self._reported, self._boxes = keep * (M @ self._reported @ M.T), keep * self._boxes
 
     def tell(self, rows: Sequence[int], boxes: Sequence[PersonBox], road: RoadProfile) -> None:
         """The boxes of the people in `rows`, one each."""
         at, samples = np.asarray(rows), samples_of(boxes, road, self.config)
-        self._told[at] += samples
+        self._reported[at] += samples
         self._boxes[at] += samples[:, 0, 0] > 0.0
 
     def by_others(self) -> Floats:
@@ -102,11 +102,11 @@ class SharedRoad:
 
     def _samples(self) -> Floats:
         """(N, 3, 3) means of each one's boxes, with weights of Cauchy: a child, or hidden feet, tells another tilt."""
-        samples = self._told / np.maximum(self._boxes, 1.0)[:, None, None]
+        samples = self._reported / np.maximum(self._boxes, 1.0)[:, None, None]
         prior, weight = np.linalg.inv(self._P), np.ones(len(samples))
         for _ in range(ITERATIONS):
-            told = (weight[:, None, None] * samples).sum(axis=0)
-            x = np.linalg.solve(told[_SHARED, _SHARED] + prior, told[_SHARED, _TILT] + prior @ self._x)
+            reported = (weight[:, None, None] * samples).sum(axis=0)
+            x = np.linalg.solve(reported[_SHARED, _SHARED] + prior, reported[_SHARED, _TILT] + prior @ self._x)
             off = np.array([-x[_T], -x[_D], 1.0])
             weight = 1.0 / (1.0 + off @ samples @ off / 4.0)
         return weight[:, None, None] * samples

@@ -19,7 +19,7 @@ class Boxes3d:
     `alpha_rad` is the observation angle: the yaw in ego less the centre's bearing, REP-103 (0 faces away from the
     camera, pi/2 faces left). `flip` is the probability that front and rear are swapped.
 
-    With `canonical_focal_rel` > 0 depths are those of a canonical camera, whose focal length is so many times its
+    With `canonical_focal_rel` > 0 depths are those of a canonical camera, whose focal length is this factor times its
     image's width; `in_metres` converts them.
     """
 

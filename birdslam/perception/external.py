@@ -28,7 +28,7 @@ def external_detections(
     `scores` (N,) in [0, 1], 1 where left out. `track_ids` (N,) are another tracker's, which are kept; a negative one is
     of no track yet. `distorted`: the boxes were drawn on this camera's images as they come, not on undistorted ones.
     `detector` is its family, which says how sure edges are (families.py), or that 1-sigma where it was measured. Raises
-    ValueError for numbers that are none, and for a family that is none.
+    ValueError for invalid numbers and for an unknown family.
     """
     boxes = np.asarray(boxes_px, np.float64).reshape(-1, 4) if np.size(boxes_px) else np.zeros((0, 4))
     count = len(boxes)

@@ -297,7 +297,7 @@ class MetricDepth(
     """(1, 1, h, w) or (1, h, w) depth along the optical axis over the whole input, in units of `metres_per_unit`.
 
     What lies outside of min_depth_m to max_depth_m is moved to that bound. `canonical_focal_rel` > 0: the network
-    answers as if the focal length were so many times the image's width, and is brought to the camera's own.
+    answers for a focal length of this factor times the image width, and is scaled to the camera's.
     """
 
     output: str

@@ -101,7 +101,7 @@ class _Bound:
 
     def infer(self) -> bool:
         """Runs on what is in the input; False where an output holds a number that is not finite."""
-        image = self._image  # bound anew for each run: an accelerator takes its copy when the input is bound
+        image = self._image  # bound again for each run: an accelerator takes its copy when the input is bound
         self._binding.bind_input(self._name, "cpu", 0, np.float32, image.shape, image.ctypes.data)
         self._session.run_with_iobinding(self._binding)
         self._binding.synchronize_outputs()

@@ -188,7 +188,7 @@ class Networks:
 
         `result()` of what is returned is to be asked for once, before the next start. The image must stay as it is
         while a head may read it. None (no pixels in this frame) starts nothing. A frame_id that doesn't grow is a
-        source that began anew: what is known of the old frames is forgotten.
+        source that restarted: what is known of the old frames is forgotten.
         """
         if frame_id <= self._last_frame:
             self._slots = [_Slot(s.head, s.fills, s.running, outdated=s.running is not None) for s in self._slots]
@@ -197,7 +197,7 @@ class Networks:
             detections = self._detections.get(frame_id, NO_DETECTIONS)
         if detections is not None:
             only = BESIDE_BOXES if only is None else tuple(role for role in only if role in BESIDE_BOXES)
-        begun = False
+        started_any = False
         for slot in self._slots:
             every = slot.head.schedule.every * self.slowdown
             due = slot.started_frame is None or frame_id - slot.started_frame >= every
@@ -205,8 +205,8 @@ class Networks:
             wanted = bool(feeds) and (only is None or not feeds.isdisjoint(only))
             if image is not None and due and wanted and slot.running is None:
                 slot.running = self._submit(self._begin(slot, frame_id), image)
-                begun = True
-        self.looks += begun
+                started_any = True
+        self.looks += started_any
         pending = _Started(self, frame_id)
         if detections is None:
             return pending

@@ -1,6 +1,6 @@
 """How rmw_zenoh_cpp names topics and nodes on zenoh, and what it attaches to a message.
 
-After its design (docs/design.md there) and what its releases since Jazzy send: topics are keys, who is there is told by
+After its design (docs/design.md there) and what its releases since Jazzy send: topics are keys, presence is shown by
 liveliness tokens, in which `%` stands for `/`; a message is CDR, with its number, time and publisher attached.
 """
 

@@ -16,7 +16,7 @@ from birdslam.geometry.camera import GroundPlane
 from birdslam.ros.frames import StaticFrames
 from birdslam.trajectory import Transform, inverse, mount_pose
 
-COURSE_M = 5.0  # the course is taken between two fixes so far apart: GNSS is some 1 m off; chosen on no data
+COURSE_M = 5.0  # the course is taken between two fixes so far apart: GNSS is some 1 m off; a judgement
 WGS84_A_M, WGS84_E2 = 6378137.0, 6.69437999014e-3  # semi-major axis, first eccentricity squared
 
 

@@ -1,7 +1,7 @@
 """The drive that ships with birdslam: rendered in the built-in world, with its truth; read with OpenCV and numpy alone.
 
 One file, `drive.npz`: every image as WebP, and what was true when it was taken.
-`world/demo_world.py` says what happens in it; `birdslam demo-drive make` renders it anew.
+`world/demo_world.py` says what happens in it; `birdslam demo-drive make` renders it again.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ class DemoRecording(Recording):
     def truth_lines(self, index: int) -> tuple[TrueLine, ...]:
         """Every line around the ego in a frame. Raises DatasetError where the drive has none."""
         if self._lines is None:
-            raise DatasetError(f"{self._path}: has no true lines: render it anew (`python -m perf roads --keep DIR`)")
+            raise DatasetError(f"{self._path}: has no true lines: render it again (`python -m perf roads --keep DIR`)")
         rows = self._lines[self._lines[:, 0] == index * self._stride].astype(np.float64)
         return tuple(
             TrueLine(int(line), LINE_KINDS[int(kind)], rows[(rows[:, 1] == line) & (rows[:, 2] == kind), 3:])

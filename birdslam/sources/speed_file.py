@@ -19,7 +19,7 @@ from birdslam.sources.speed_log import SpeedLog
 from birdslam.sources.speed_tables import names_columns, table_readings
 from birdslam.types import NS_PER_S, SpeedReading
 
-# 1-sigma where a file states none; chosen on no data: some steps of a wheel sensor's message (often 0.1 km/h), and
+# 1-sigma where a file states none; a judgement: some steps of a wheel sensor's message (often 0.1 km/h), and
 # the bias of a stability control's gyroscope (0.6 degrees a second).
 SIGMA_MPS = 0.1
 YAW_RATE_SIGMA_RADPS = 0.01
@@ -32,7 +32,7 @@ def read_speeds(path: Path) -> SpeedLog:
     """The readings of a file in its order, unchecked: the method rejects those of a faulty sensor (NaN, backwards in
     time).
 
-    Raises DatasetError for a file that can't be read, a line that is none, and an empty file.
+    Raises DatasetError for a file that can't be read, an invalid line, and an empty file.
     """
     readings = [reading for _, reading in _lines(path)]
     if not readings:

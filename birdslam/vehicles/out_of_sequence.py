@@ -64,7 +64,7 @@ class OutOfSequenceTracker:
         self._used_frame = -1  # of the newest detections that were used
 
     def open_frame(self, frame: OpenFrame) -> None:
-        """A new frame. One whose number does not grow is of a source that began anew: nothing is awaited any more."""
+        """A new frame. One whose number does not grow is of a source that restarted: nothing is awaited any more."""
         if frame.ego.frame_id <= self._newest_frame:
             self._settle_before(self._newest_frame + 1)
             self._used_frame = -1
@@ -113,7 +113,7 @@ class OutOfSequenceTracker:
         depth: DepthMap | None = None,
         road: NDArray[np.bool_] | None = None,
     ) -> list[Track]:
-        """The oldest open frame, with its detections or without any; `road` is to be predicted anew after it."""
+        """The oldest open frame, with its detections or without any; `road` is to be predicted again after it."""
         frame = self._open.popleft()
         self.road = self.ground_size
         _predict(self.ground_size, frame)

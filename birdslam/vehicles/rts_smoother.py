@@ -30,7 +30,7 @@ STANDING_PROBABILITY = 0.5  # the probability from which on a vehicle is taken t
 MIN_COV_SHARE = 0.1  # of a measurement's variance along the line of sight: not all of it is the size's
 MIN_DEPTH_M = 1.0
 MIN_SIGMA_LOG_HEIGHT = 1e-3
-NOT_JUDGED = 0.5  # the probability of standing in an estimate of what nobody knows, or where no graph judges it
+NOT_JUDGED = 0.5  # probability of being stationary where it is unknown, or where no graph estimates it
 MIN_PROBABILITY = 1e-3  # and 1 less it is the largest
 
 
@@ -147,8 +147,8 @@ def _log_height(seen: Sequence[VehicleMeasurement]) -> float:
     most = float(gained.max())
     if most <= 0.0:
         return float(log_height[-1])
-    told = information * log_height - information[0] * log_height[0]  # gained times the height that it is of
-    of_frames = float(gained @ told / (gained @ gained))
+    reported = information * log_height - information[0] * log_height[0]  # gained times the height that it is of
+    of_frames = float(gained @ reported / (gained @ gained))
     return float((information[0] * log_height[0] + most * of_frames) / (information[0] + most))
 
 

@@ -252,7 +252,7 @@ class Tracker:
             track.motion = self._predicted_motion(track, frame)
             track.stands = bool(stands[k])
             if track.stands and nis[k] > self.config.gate_sigma**2:
-                # Its size was estimated anew, which moves its place without a motion
+                # Its size was estimated again, which moves its place without a motion
                 track.state[:2] += innovation[k]
                 track.first_m = track.first_m + innovation[k]
                 track.cov[:2, :], track.cov[2:, :2] = 0.0, 0.0

@@ -143,7 +143,7 @@ def _clear_of_the_road(street: Street, standing: Standing, built: Bodies) -> Boo
 
 
 def _reversed(street: Street) -> Street:
-    """The same road for who drives against its s."""
+    """The same road for a vehicle that drives against its s."""
     length_m = street.length_m
     bands = street.bands[:, [1, 0, 3, 2, 4, 5]] * np.array([-1, -1, 1, 1, 1, 1], np.float32)
     lines = street.lines * np.array([-1, *[1] * 8], np.float32)

@@ -3,7 +3,7 @@
     python -m perf films [FILM ...] [--part PART ...] [--seconds S] [--begin-at S ...] [--output DIR] [--data DIR]
                          [--networks] [--model ROLE=PATH ...]
     python -m perf films FILM --run DIR     # what `birdslam run --output DIR` left of it, by seconds
-    python -m perf films [FILM ...] --calibrate --output DIR     # their camera files anew (CAMERAS), nothing else
+    python -m perf films [FILM ...] --calibrate --output DIR     # their camera files again (CAMERAS), nothing else
 
 The odometry alone drives each variant (film_variants.py), all of a film by one camera file, the same each day.
 """
@@ -93,7 +93,7 @@ FILMS = {
     "01": Film("kitti:{data}/kitti_odometry/sequences/01"),
 }
 DEFAULT = ("town", "town_72", "motorway", "00", "0005")
-# A file for each film that has no camera of its own, by `calibrate` of a day that it names: found anew, its tilt would
+# A file for each film that has no camera of its own, by `calibrate` of a day that it names: found again, its tilt would
 # differ with each change of the code, and the tables would compare days in place of sizes and rates
 CAMERAS = Path(__file__).resolve().parents[1] / "film_cameras"
 
@@ -104,7 +104,7 @@ def run(arguments: list[str]) -> None:
     parser.add_argument("--part", action="append", choices=PARTS, help="this one alone; repeatable")
     parser.add_argument("--begin-at", type=float, nargs="+", metavar="S", help="of the film")
     parser.add_argument("--seconds", type=float, default=SECONDS, help="of each variant")
-    parser.add_argument("--calibrate", action="store_true", help="find the films' cameras anew, into --output")
+    parser.add_argument("--calibrate", action="store_true", help="find the films' cameras again, into --output")
     parser.add_argument("--run", type=Path, metavar="DIR", help="compare what `birdslam run` left there of the film")
     add_data(parser)
     add_networks(parser)
@@ -154,8 +154,10 @@ def measure_all(options: argparse.Namespace) -> list[dict[str, Any]]:
                         figures = summary(course, between_mps)
                         unchanged = unchanged or figures
                         figures["way_over_unchanged"] = over(figures, unchanged)
-                        begun = "" if begin_s == 0.0 else f", from {begin_s:g} s"
-                        ledger.add(f"{name}: {variant.name}{begun}", row_text(figures), film=name, part=part, **figures)
+                        started = "" if begin_s == 0.0 else f", from {begin_s:g} s"
+                        ledger.add(
+                            f"{name}: {variant.name}{started}", row_text(figures), film=name, part=part, **figures
+                        )
         rows: list[dict[str, Any]] = ledger.content["rows"]
     return rows
 

@@ -168,7 +168,7 @@ def read(recording: DemoRecording, edit: Edit | None = None, most: int = 10**6) 
 def measure(
     drive: Drive, begin_at: Sequence[int] = (0,), every: int | None = None, images: int = 25
 ) -> dict[str, Any]:  # fmt: skip
-    """The odometry from some images on to the drive's last; and, with `every`, from each so many-th over some anew.
+    """The odometry from some images on to the drive's last; and, with `every`, from each so many-th over some again.
 
     Of the ways "scale_errors" has each one's; all else counts them together.
     """

@@ -78,13 +78,13 @@ def _configuration(runtime_dir: Path, rate_hz: float, settings: tuple[str, ...])
 def _row(
     vehicles: int, bus: Bus, process: psutil.Process, log: list[Measurements], rate_hz: float, warm_up_s: float
 ) -> dict[str, Any]:
-    begun = round(rate_hz * warm_up_s)
+    started = round(rate_hz * warm_up_s)
     steal, before_s, begun_s = Steal(), 0.0, 0.0
     messages: list[Message] = []
     for number, message in enumerate(_played(bus, log, rate_hz)):
-        if number == begun:
+        if number == started:
             steal, before_s, begun_s = Steal(), _cpu_s(process), time.monotonic()
-        if number >= begun and message is not None:
+        if number >= started and message is not None:
             messages.append(message)
     cpu_cores = (_cpu_s(process) - before_s) / (time.monotonic() - begun_s)
     split: dict[str, list[float]] = {}
@@ -95,8 +95,8 @@ def _row(
     return {
         "vehicles": vehicles,
         "tracked": round(float(np.mean([len(message.record.vehicles) for message in messages])), 1),
-        "frames": len(log) - begun,
-        "dropped": len(log) - begun - len(messages),
+        "frames": len(log) - started,
+        "dropped": len(log) - started - len(messages),
         "cpu_cores": round(cpu_cores, 4),
         "rss_mb": round(process.memory_info().rss / 2**20, 1),
         "stages": {name: spread(values) for name, values in split.items()},

@@ -200,17 +200,17 @@ def size(ledger: Ledger) -> None:
                     *(np.full(MAX_POINTS, 0.05), descriptors, CAMERA.height_m),
                 )
             )
-        begun = time.process_time()
+        started = time.process_time()
         index = place_map.index()
         index.look_up(place_map.keyframes[0].descriptors, 6)
-        built_s = time.process_time() - begun
+        built_s = time.process_time() - started
         took_ms, right = [], 0
         for number in range(0, count, max(1, count // LOOK_UPS)):
             own = place_map.keyframes[number].descriptors
             seen = own ^ np.packbits(chance.random((MAX_POINTS, 8 * DESCRIPTOR_BYTES)) < SAME_BITS, axis=1)
-            begun = time.process_time()
+            started = time.process_time()
             found = index.look_up(seen, 6)
-            took_ms.append(1e3 * (time.process_time() - begun))
+            took_ms.append(1e3 * (time.process_time() - started))
             right += number in found
         data = len(encode_map(place_map))
         p50_ms, worst_ms = float(np.median(took_ms)), max(took_ms)

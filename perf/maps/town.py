@@ -150,7 +150,7 @@ def _localise(kept: bytes, drive: _Drive, frames: Iterable[Seen]) -> list[Locali
 
 
 def _errors(found: Localisation, true: SE2, place_map: PlaceMap, at: dict[int, SE2]) -> Floats:
-    """Of a pose, against the keyframe nearest to it: that the map is bent as a whole is told by its keyframes."""
+    """Error of a pose relative to the nearest keyframe; the keyframes measure the distortion of the map."""
     assert found.T_map_ego is not None
     nearest = min(place_map.keyframes, key=lambda k: _apart(k.T_map_keyframe, found.T_map_ego))  # type: ignore[arg-type]
     T_true = at[nearest.number].between(true)

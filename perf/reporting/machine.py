@@ -58,11 +58,11 @@ class Steal:
     """The share of processor time that the hypervisor gave to others since construction."""
 
     def __init__(self) -> None:
-        self._begun = _ticks()
+        self._started = _ticks()
 
     def percent(self) -> float:
         """Of all time of all cores."""
-        passed = [now - then for now, then in zip(_ticks(), self._begun, strict=True)]
+        passed = [now - then for now, then in zip(_ticks(), self._started, strict=True)]
         return round(100.0 * passed[_STEAL] / max(1, sum(passed)), 3)
 
 

@@ -158,7 +158,7 @@ def page(rows: list[dict[str, Any]]) -> str:
         "`rain` nothing is known but that it drives, at 15 to 35 m/s. *Beyond* are seconds whose way is off by more",
         "than two of the stated sigma, the camera's share in it; *standstill* are images that say so while the car",
         "drives, *outside* valid ones with a speed that the car cannot have had. All variants of a film are driven by",
-        "one camera file (`perf/film_cameras`). *Noise* adds 1.5 grey to each pixel, drawn anew, and changes nothing",
+        "one camera file (`perf/film_cameras`). *Noise* adds 1.5 grey to each pixel, drawn again, and changes nothing",
         "else: by as much differ the metres of any two films that a driver would call the same.",
     ]
     for part in dict.fromkeys(row["part"] for row in rows):

@@ -131,7 +131,7 @@ def _run(task: Task, output: Path, uri: str, on_frame: OnFrame) -> None:
             motion, known = _Motion(frames, on_frame, drive_map), _known(recording, frames)
             (report,) = evaluate_recordings([recording], motion.watched(drive), working, compared=known)
         if drive_map is not None:
-            again = open_source(configuration)  # its frames once more
+            again = open_source(configuration)  # its frames again
             assert isinstance(again, RecordedSource)
             drive_map.finish(recording.camera, one_map.frames(again.recording, frames), working / task.name)
         result = _result(task, working / task.name, motion, report)

@@ -95,7 +95,7 @@ class _Pool:
                 process.terminate()
 
     def _run(self, task: Task) -> Failure | None:
-        def begun(process: subprocess.Popen[bytes]) -> None:
+        def started(process: subprocess.Popen[bytes]) -> None:
             with self._lock:
                 self._running.add(process)
                 if self._stopped:
@@ -104,12 +104,12 @@ class _Pool:
         if self._stopped:
             return None
         job = Job(task, str(self._output))
-        return run_job(job, begun, lambda share: self.events.put(Event(task, share)))
+        return run_job(job, started, lambda share: self.events.put(Event(task, share)))
 
 
 def run_job(
     job: Job,
-    begun: Callable[[subprocess.Popen[bytes]], object] = lambda process: None,
+    started: Callable[[subprocess.Popen[bytes]], object] = lambda process: None,
     on_share: Callable[[float], object] = lambda share: None,
 ) -> Failure | None:
     """Runs a drive in a process of its own, and waits for its end; None where its results are in place."""
@@ -117,7 +117,7 @@ def run_job(
     command = [sys.executable, "-m", "birdslam.runtime.batch.drive", str(os.getpid())]
     with tempfile.TemporaryFile() as said:
         process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=said)
-        begun(process)
+        started(process)
         status = _attend(process, job, on_share)
         if status == 0:
             return None

@@ -254,7 +254,7 @@ def _source(configuration: Configuration) -> Iterator[Finding]:
         yield Finding("camera", "error", str(error), "check the cable, the files, and the group 'video'")
         return
     except StopIteration:
-        yield Finding("camera", "error", f"{source.name}: has no frame", "record it anew, or name another source")
+        yield Finding("camera", "error", f"{source.name}: has no frame", "record it again, or name another source")
         return
     source.close()
     size = "unreadable" if first.image is None else f"{first.image.shape[1]}x{first.image.shape[0]} px"

@@ -22,7 +22,7 @@ from birdslam.runtime.fleet.reading import FleetReading, Received, VehicleSlot
 from birdslam.runtime.topology import TOPICS, check_name, every_key, key_of, vehicle_and_topic
 from birdslam.runtime.transport.bus import BusClosed
 from birdslam.runtime.transport.closing import Closing
-from birdslam.runtime.transport.replies import REPLY_S, ask_aside, whole_reply
+from birdslam.runtime.transport.replies import REPLY_S, query_in_background, whole_reply
 from birdslam.runtime.transport.reply_parts import whole_map, whole_trajectory
 from birdslam.runtime.transport.session import close_session
 from birdslam.runtime.wire import Health, WireError, decode
@@ -116,7 +116,7 @@ class Fleet(Closing):
             asks = alive and node == "optimize" and not slot.t_received_ns
             self._changed.notify_all()
         if asks:
-            ask_aside(self._session, key_of(vehicle, "estimate"), self._receive_retained)
+            query_in_background(self._session, key_of(vehicle, "estimate"), self._receive_retained)
 
     # --- what the user calls ---
 

@@ -168,7 +168,7 @@ class Receiver:
                 arrived_ns = self._take_line(reader, line, arrived_ns, now_ns)
 
     def _take_line(self, reader: NmeaReader, line: bytes, arrived_ns: int, now_ns: int) -> int:
-        begun = reader.waits
+        started = reader.waits
         try:
             found = reader.take(line[:MAX_LINE_BYTES].decode("ascii", errors="replace"))
         except ValueError:
@@ -178,7 +178,7 @@ class Receiver:
             with self._lock:
                 self._fixes.append((arrived_ns, found))
                 del self._fixes[:-MAX_FIXES]
-        return now_ns if reader.waits != begun else arrived_ns
+        return now_ns if reader.waits != started else arrived_ns
 
     def take(self, offset_ns: int) -> list[GnssFix]:
         """New fixes; `offset_ns`: of the recording's clock from CLOCK_MONOTONIC."""

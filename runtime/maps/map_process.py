@@ -3,7 +3,7 @@
 `python -m birdslam.runtime.maps.map_process map VITALS_FD PARENT_PID`, on standard input the configuration as a line of
 JSON, then an `Assignment` as another. It ends when the end of the source has come through, or on SIGTERM. Exit status:
 0 when all is written; 2 where the map can't be used, 3 where the disk failed it in the end, each with one ERROR line;
-1 for a bug. One that died or stalled is begun anew with the map as it was last saved, and goes on where it had come to
+1 for a bug. One that died or stalled is restarted with the map as it was last saved, and goes on where it had come to
 if odometry does. Its map is saved whole every ten seconds or so; a disk that is full costs what was not saved yet.
 """
 

@@ -133,7 +133,7 @@ class Inference(Closing):
         heads, period_ms = self.networks.heads, perceive.period_ms
         if not (self._adapts and heads) or any(self._specs[head.role].every is not None for head in heads):
             return None
-        if camera is None or period_ms is None:  # nobody knows the frames yet
+        if camera is None or period_ms is None:  # the frames are not known yet
             return None
         runs: dict[str, Run] = {head.role: head.run for head in heads}
         if self._boxes_alone is not None:
@@ -162,18 +162,18 @@ class Inference(Closing):
         """Runs a function on a thread of its own; None at rate "max", where nothing may depend on the clock.
 
         It begins when the frame at hand is over: it would take the interpreter's lock from what goes out. A frame that
-        comes meanwhile it lets pass, where it calls `give_way`.
+        comes meanwhile it lets pass, where it calls `yield_core`.
         """
         return None if self._deadline_ns is None else self._run_aside
 
-    def give_way(self) -> None:
+    def yield_core(self) -> None:
         """Waits for the end of the frame at hand, if there is one."""
         if self._deadline_ns is not None:
             self._frame_over.wait()
 
     def _run_aside(self, run: Run, *arguments: Any) -> Future[Any]:
         def when_over() -> Any:
-            self.give_way()
+            self.yield_core()
             return run(*arguments)
 
         return self._beside.submit(when_over)
@@ -193,7 +193,7 @@ class Inference(Closing):
             self.aside,
             self._lanes_every,
             lambda: min(self.networks.slowdown, LANES_SPARING),
-            self.give_way,
+            self.yield_core,
         )
 
     @property

@@ -1,6 +1,6 @@
 """The process of a sender: it waits for its router, sends until it is asked to end, and lives through the router's end.
 
-Its vehicle waits for no network: systemd is told at once that it is ready.
+Its vehicle waits for no network: it notifies systemd at once.
 """
 
 from __future__ import annotations

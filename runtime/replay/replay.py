@@ -144,8 +144,8 @@ class Comparison:
             self.verdict.epochs += estimate.epoch != self._epoch
             self._epoch = estimate.epoch
             number = message.trace.number
-            anew = self._alive > self._alive_before or number <= self._number
-            self._lost = number > (1 if anew else self._number + 1)
+            again = self._alive > self._alive_before or number <= self._number
+            self._lost = number > (1 if again else self._number + 1)
             self._number, self._alive_before = number, self._alive
             if not by_measurements:
                 taken = self._replay(estimate, message.data, self._reported_before(estimate), None)
@@ -240,10 +240,10 @@ class Comparison:
             for last, given in itertools.product((self._state.last, None), ([*open_, *now], now)):
                 yield self._copy(last, restored), given, 1
         if self._began_unseen(estimate):
-            begun = min(came_back, 2 if restored else 1)  # the process that began the epoch, and the one after it
+            started = min(came_back, 2 if restored else 1)  # the process that began the epoch, and the one after it
             for start in range(len(open_)):
                 graph = PoseGraph(*self._back_end, estimate.epoch)
-                yield _State(graph, unreported=restored), [*open_[start:], *now], begun
+                yield _State(graph, unreported=restored), [*open_[start:], *now], started
         if open_:
             yield self._copy(), now, 0
         yield self._state, [*open_, *now], 0

@@ -183,7 +183,7 @@ class RosCamera:
 
     def _count(self, sample: zenoh.Sample) -> None:
         """The images, and by their numbers those that their sender or the router has dropped; another sender's begin
-        anew."""
+        again."""
         number = None if sample.attachment is None else sequence_of(sample.attachment.to_bytes())
         if number is not None and 0 < self._number < number:
             self._lost += number - self._number - 1

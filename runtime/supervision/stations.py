@@ -53,7 +53,7 @@ class Intake:
         self._since_s = 0.0
 
     def missed(self, sent: int, taken: int, silent_s: float, now_s: float, limit_s: float) -> int:
-        """How many records in a row, where that has gone on for too long; else 0. Counters that fall begin anew.
+        """How many records in a row, where that has gone on for too long; else 0. Counters that fall restart.
 
         A loop that has not beaten for half the limit does not count here: it may be about to count as stalled.
         """

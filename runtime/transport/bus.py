@@ -29,7 +29,7 @@ from birdslam.runtime.transport.endpoints import (
 )
 from birdslam.runtime.transport.presence import runtime_dir_of, socket_path
 from birdslam.runtime.transport.queries import QueryHandler, QueryResponder
-from birdslam.runtime.transport.replies import REPLY_S, ask_aside, replies, whole_reply
+from birdslam.runtime.transport.replies import REPLY_S, query_in_background, replies, whole_reply
 from birdslam.runtime.transport.session import close_session, open_session, session_config
 from birdslam.runtime.wire import WireError
 
@@ -100,7 +100,7 @@ class Bus(Closing):
 
     def catch_up(self, topic: str, subscriber: Subscriber) -> None:
         """Gives a subscriber that came late the topic's last message, when it comes; waits for nothing."""
-        ask_aside(self._session, key_of(self.vehicle, topic), subscriber._receive_retained)
+        query_in_background(self._session, key_of(self.vehicle, topic), subscriber._receive_retained)
 
     def retained(self, topic: str, timeout_s: float = REPLY_S) -> list[Message]:
         """The topic's retained messages (Topic.retained), oldest first; empty where no reply comes in time.

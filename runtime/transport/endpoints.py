@@ -124,8 +124,8 @@ class Publisher:
         data = encode(record)
         now_ns = time.monotonic_ns()
         self._sent += 1
-        begun = trace if trace and trace.stages else Trace((Stage(self._node, now_ns, now_ns),))
-        attachment = encode(begun.sent(now_ns, self._sent))
+        started = trace if trace and trace.stages else Trace((Stage(self._node, now_ns, now_ns),))
+        attachment = encode(started.sent(now_ns, self._sent))
         if self._retained is not None:
             self._retained.add(data, attachment)
         try:

@@ -29,7 +29,7 @@ def replies(session: zenoh.Session, selector: str | zenoh.Selector, timeout_s: f
             raise BusError(f"{selector}: {bytes(reply.err.payload).decode(errors='replace')}")
 
 
-def ask_aside(session: zenoh.Session, key: str, callback: Callable[[zenoh.Reply], None]) -> None:
+def query_in_background(session: zenoh.Session, key: str, callback: Callable[[zenoh.Reply], None]) -> None:
     """Hands what answers a query to `callback`, on zenoh's thread, as it comes; waits for nothing.
 
     It may itself be called on zenoh's thread while another one closes the session: then there is nothing to be had.

@@ -1,4 +1,4 @@
-"""Rendering the shipped drive anew, and writing it as `DemoRecording` reads it."""
+"""Rendering the shipped drive again, and writing it as `DemoRecording` reads it."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ class BatchConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     iterations: int = 500  # at the most; `Convergence` says whether they were enough
 
 
-_UNKNOWN_REL = 0.3  # 1-sigma of a place, as a share of its range, that is none
+_UNKNOWN_REL = 0.3  # 1-sigma of an unknown position, as a share of its range
 _WIDE_SCALE = 1e3  # 1-sigma of an unknown scale, so that a log without any vehicle can be solved
 _SCALE_STEP = 1e-4  # for its derivative
 _SCALE_TOLERANCE = 1e-7  # of it
@@ -93,7 +93,7 @@ def _placed(m: Measurements) -> Measurements:
 
 
 def _mean_step_m(log: Sequence[Measurements]) -> float:
-    """What a scale-ambiguous odometry takes for its unit of length: here the mean step."""
+    """What a scale-ambiguous odometry takes for its scale: here the mean step."""
     steps = [np.hypot(m.cc.T_from_to.x_m, m.cc.T_from_to.y_m) for m in log if m.cc is not None]
     return max(float(np.mean(steps)), 1e-3) if steps else 1.0
 

@@ -168,7 +168,7 @@ class Motions:
 
 
 def moved_by_turn(T_first_last: SE2) -> Floats:
-    """(3,) how a motion, in the tangent at its end, goes with a turn of the axes in which its way is told (per rad)."""
+    """(3,) how a motion, in the tangent at its end, changes with a rotation of its axes (per rad)."""
     x_m, y_m = T_first_last.rotation().T @ np.array([-T_first_last.y_m, T_first_last.x_m])
     return np.array([x_m, y_m, 0.0])
 

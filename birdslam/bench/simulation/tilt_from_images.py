@@ -22,7 +22,7 @@ from birdslam.types import SpeedReading
 class TiltFromImages(WithoutImages):
     """An EgoMotion: a simulated one, that reports the road's pitch and roll as the images would, while it drives.
 
-    `grounds` are the true ones, by frame; where one is None, none is reported anew.
+    `grounds` are the true ones, by frame; where one is None, none is reported again.
     """
 
     def __init__(

@@ -173,7 +173,7 @@ def _preface(setting: Setting, outcomes: Sequence[Outcome]) -> str:
         "So does what has the *shape prior*, with which the paper initialises its baselines: a wireframe fitted to "
         "each box and the log's distance, as no network for keypoints is at hand "
         "(birdslam/bench/baselines/shape_prior.py).",
-        "The placing's constants were chosen on 0000-0006 and 0008, the simulated odometry is fitted to other clips; "
+        "The placing's constants were tuned on 0000-0006 and 0008, the simulated odometry is fitted to other clips; "
         "with these, 0010 and 0018 chose four of them and `confirm_hits`, 0020 what tells standing from creeping too "
         "(docs/constants.md). The true poses of 0018 and 0020 are of a stereo SLAM, whose scale is within 3 %; those "
         "of the others are of GPS and IMU.",

@@ -1,7 +1,7 @@
 """Vehicles' CP edges: where a frame's landmarks say that the vehicles stand which it sees (Eqs. 3 and 7).
 
 Eq. 7 has a unary edge between "an agent A (ego-camera or vehicle in scene)" and each point. A camera sees the point and
-the vehicle, so that the edge is the difference of the two: what the CV edge says of the vehicle is said once more, with
+the vehicle, so that the edge is the difference of the two: what the CV edge says of the vehicle is said again, with
 CP's weight, from landmarks instead of the ego. It is on the vehicle's place in the world, which the window has as ego
 pose and place in ego: both are corrected, after the other factors, so that new vehicles have it too.
 """

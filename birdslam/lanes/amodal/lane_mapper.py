@@ -44,14 +44,14 @@ class LaneHead:
     `complete` is the network that completes the grids where something occluded the road; None: not completed. `submit`
     runs a function in the background; None: within the frame. Lanes are detected after `every` frames, times
     `slowdown()`, which a busy computer raises. Between its parts of two milliseconds or so the detection calls
-    `give_way`: in the background it waits there for the frames, which need the same interpreter.
+    `yield_core`: in the background it waits there for the frames, which need the same interpreter.
     """
 
     complete: Completion | None = None
     submit: Submit | None = None
     every: int = 1
     slowdown: Callable[[], int] = lambda: 1
-    give_way: Callable[[], object] = lambda: None
+    yield_core: Callable[[], object] = lambda: None
 
 
 @dataclass(frozen=True)
@@ -119,8 +119,8 @@ class LaneMapper:
         self.edges = edges
         self.head = head
         self._submit = head.submit or _run_now
-        self._amodal = AmodalLanes(lanes, head.complete, head.give_way)
-        self._tracker, self._ego_lane = LineTracker(camera, give_way=head.give_way), EgoLane()
+        self._amodal = AmodalLanes(lanes, head.complete, head.yield_core)
+        self._tracker, self._ego_lane = LineTracker(camera, yield_core=head.yield_core), EgoLane()
         self._lines: tuple[int, TrackedLines] | None = None  # and the source time of their image
         self._frames: deque[_PastFrame] = deque(maxlen=REMEMBERED_FRAMES)
         self._images: deque[tuple[int, NDArray[np.uint8]]] = deque(maxlen=REMEMBERED_IMAGES)
@@ -134,7 +134,7 @@ class LaneMapper:
         self._stations: tuple[int, list[Station]] = (-1, [])  # and the frame that saw them
 
     def clear(self) -> None:
-        """The world frame began anew."""
+        """The world frame restarted."""
         self._frames.clear()
         self._lanes_due_frame = self._lanes_frame = None
         self._stations = (-1, [])
@@ -144,10 +144,10 @@ class LaneMapper:
         if not self._run_outdated:
             self._forget()
 
-    def lose_way(self) -> None:
-        """The way to this frame is not known in metres: what was seen before it lies nobody knows where.
+    def forget_position(self) -> None:
+        """The way to this frame is not known in metres: what was seen before it has no metric position.
 
-        The next segmentation begins anew, as a single image does.
+        The next segmentation restarts, as a single image does.
         """
         self._way_lost = True
 
@@ -263,9 +263,9 @@ class LaneMapper:
         bonnet_px: Floats | None,
         due: bool,
         image: NDArray[np.uint8] | None,
-        anew: bool,
+        again: bool,
     ) -> _LaneResult:
-        if anew:
+        if again:
             self._forget()
         lines = None
         if image is not None:
@@ -279,7 +279,7 @@ class LaneMapper:
                 bonnet_px=bonnet_px,
             )
             lines = self._tracker.lines()
-            self.head.give_way()
+            self.head.yield_core()
         road_m, boundary_m = points_of(segmentation, self.camera, then.ground, boxes_px, self._amodal.config)
         on_world_m = then.T_world_ego @ boundary_m
         found = lane_stations(
@@ -293,9 +293,9 @@ class LaneMapper:
             self.edges,
         )
         self._amodal.add(then.T_world_ego, road_m, boundary_m)
-        self.head.give_way()
+        self.head.yield_core()
         points_m, lanes = self._lanes_m(T_world_ego) if due else (np.zeros((0, 2)), np.zeros(0, dtype=np.int64))
-        self.head.give_way()
+        self.head.yield_core()
         seen_m = then.T_world_ego @ self._points_m(segmentation, then.ground, boxes_px)
         seen_m = seen_m[self._amodal.ids.lookup(seen_m) == NO_LANE]
         if len(points_m):

@@ -76,12 +76,12 @@ class AmodalLanes:
     """`add` for each segmented frame, then `lanes` in the ego of any later pose. Deterministic."""
 
     def __init__(
-        self, config: LanesConfig, complete: Completion | None = None, give_way: Callable[[], object] = lambda: None
+        self, config: LanesConfig, complete: Completion | None = None, yield_core: Callable[[], object] = lambda: None
     ) -> None:
-        """`give_way` is called between the parts of `lanes` (lane_mapper.LaneHead)."""
+        """`yield_core` is called between the parts of `lanes` (lane_mapper.LaneHead)."""
         self.config = config
         self.complete = complete
-        self._give_way = give_way
+        self._yield_core = yield_core
         self.completion_failed = False  # in the last run: its output was not finite and not used
         self._frames: deque[tuple[SE2, tuple[Points, Points]]] = deque(maxlen=config.window_frames)
         self.ids = LaneIds(config.same_lane_m, config.cell_m, config.remembered_m)
@@ -100,16 +100,16 @@ class AmodalLanes:
         self._frames.append((T_world_ego, (road, boundary)))
 
     def clear(self) -> None:
-        """The world frame began anew: points and lanes are dropped."""
+        """The world frame restarted: points and lanes are dropped."""
         self._frames.clear()
         self.ids.clear()
 
     def lanes(self, T_world_ego: SE2) -> tuple[LaneCloud, ...]:
         """The lanes around the ego at `T_world_ego`, each with its id."""
         grids = self.grids(T_world_ego)
-        self._give_way()
+        self._yield_core()
         completed = None if self.complete is None else self.complete(grids)
-        self._give_way()
+        self._yield_core()
         self.completion_failed = completed is not None and not np.isfinite(completed).all()
         if completed is None or self.completion_failed:
             return self.ids.assign(T_world_ego, segregate(grids, self.config))

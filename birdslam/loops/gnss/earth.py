@@ -142,7 +142,7 @@ class Earth:
 
 
 def _view_deg(camera: Camera, scale: float) -> float:
-    """Across, by a focal length so many times the camera's; its distortion left out, as where a view is stated."""
+    """By a multiple of the camera's focal length, without distortion."""
     half = 0.5 * camera.width_px / (scale * camera.fx_px)
     return 2.0 * math.degrees(half if camera.fisheye else math.atan(half))
 

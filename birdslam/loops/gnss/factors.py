@@ -24,7 +24,7 @@ from birdslam.loops.keyframe import Fixed, Link, Placed
 from birdslam.types import NS_PER_S
 
 REACH_M = 6.0  # from a fix to its keyframe, along the way
-SHARED_S = 10.0  # errors of fixes so near in time are one error; chosen on no data
+SHARED_S = 10.0  # errors of fixes so near in time are one error; a judgement
 ROUNDS = 2  # of the scale: keyframes have their own, and take up the rest
 
 

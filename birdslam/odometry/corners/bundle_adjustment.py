@@ -29,7 +29,7 @@ def adjust(window: SlidingWindow, iterations: int, max_landmarks: int, prior: Fl
     """Adjusts all poses of the window but the oldest, and the `max_landmarks` landmarks with most observations.
 
     `prior` (6,) is the information of each pose (translation, rotation vector) against its previous estimate. It damps,
-    and it holds the unit of length, which no image observes, at the mean of all poses. Fixing two poses would hold it
+    and it holds the scale, which no image observes, at the mean of all poses. Fixing two poses would hold it
     too, but with the error of one short baseline. A position from the velocity prior keeps _POSITION_PRIOR_SHARE of its
     sigma: the images are in it already.
     """
@@ -193,7 +193,7 @@ def _solve(normal: _NormalEquations, priors: Floats, total: Floats) -> tuple[Flo
 def _write_back(
     window: SlidingWindow, problem: _Problem, residuals: _Residuals, normal: _NormalEquations, rho: Floats
 ) -> None:
-    """Writes the result back. A landmark with mostly outlier observations becomes unknown, until triangulated anew."""
+    """Writes the result back. A landmark with mostly outlier observations becomes unknown, until triangulated again."""
     rotations = orthonormal(window.stacked()[0])
     window.poses = [Pose(R, T.p) for R, T in zip(rotations, window.poses, strict=True)]
     window.rho[problem.landmarks] = rho

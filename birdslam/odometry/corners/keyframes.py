@@ -18,7 +18,7 @@ Ints = NDArray[np.int64]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
 
-# Information of a pose's step, (translation, rotation): loose, but nothing else holds the unit of length.
+# Information of a pose's step, (translation, rotation): loose, but nothing else holds the scale.
 _STEP_PRIOR = np.array([1.0 / 0.3**2] * 3 + [1e2] * 3)
 _MIN_MATCHES = 10  # landmarks that two images must share for a parallax
 
@@ -29,7 +29,7 @@ class KeyframeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     keyframes: Annotated[int, msgspec.Meta(ge=3)] = 8  # keyframes that are adjusted together
     adjusted_landmarks: Count = 400  # at most so many of them
     adjust_iterations: Count = 1  # Gauss-Newton steps an image: the next one goes on from there
-    # A short window under far landmarks loses its unit of length: by parallax alone a film of 30 Hz has keyframes 0.4 m
+    # A short window under far landmarks loses its scale: by parallax alone a film of 30 Hz has keyframes 0.4 m
     # apart, and its window is 3 m long. So the distance decides, at any rate; the parallax only where houses are near
     keyframe_parallax_px: Positive = 60.0  # median parallax of a new keyframe, rotation compensated
     # With the road's comparisons left out, the town dashcam film's unit drifts from 0.97 to 1.27 of GPS in 17 s at

@@ -1,7 +1,7 @@
 """The sliding window of the odometry: the last keyframes and the landmarks that they share.
 
 A landmark is parametrised by its inverse depth along the ray of its anchor, the first keyframe of the window that saw
-it (Civera et al. 2008). Coordinates are normalised ones of an undistorted camera; the unit of length is the caller's.
+it (Civera et al. 2008). Coordinates are normalised ones of an undistorted camera; the scale is the caller's.
 """
 
 from __future__ import annotations

@@ -60,7 +60,7 @@ class _Stretch:
         self._ids, self._px = ids, px
 
     @property
-    def begun(self) -> bool:
+    def started(self) -> bool:
         """Whether there were corners to begin with."""
         return len(self._ids) > 0
 
@@ -90,7 +90,7 @@ class FixedCorners:
 
     def begin(self, ids: Ints, px: Floats) -> None:
         """Takes the corners of the image before the first of `update`, as it does."""
-        if not self._stretch.begun:
+        if not self._stretch.started:
             self._stretch.begin(ids, px)
 
     def update(self, ids: Ints, px: Floats, ground: GroundPlane, driven_m: float | None) -> Bools:

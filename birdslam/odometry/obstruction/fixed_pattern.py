@@ -50,7 +50,7 @@ class FixedPattern:
     def update_mean(self, grey: NDArray[np.uint8], top_px: int, travelled_m: float) -> None:
         """Takes (H, W) grey into the mean, rows from `top_px` on, `travelled_m` after the image before.
 
-        All of the first images count alike, at any rate and while the unit of length may be far too small.
+        All of the first images count alike, at any rate and while the scale may be far too small.
         """
         cfg, rows = self.config, grey[top_px:]
         if self._mean is None or self._recent is None:

@@ -274,7 +274,7 @@ class RoadAligner:
         root = np.sqrt(np.maximum(below**2 + 2.0 * height_m * x[3], _BEHIND_CREST * below**2))
         rho = (below + root) * (0.5 / height_m)
         shift = rho * _translation(T_past_present, x)[:, None]
-        q = begun = rotation_exp(x[ROAD : ROAD + 3]) @ view.turned + shift
+        q = started = rotation_exp(x[ROAD : ROAD + 3]) @ view.turned + shift
         by_z = 1.0 / np.maximum(q[2], _MIN_DEPTH)
         if not view.share:
             return _Places(q[0] * by_z, q[1] * by_z, by_z, rho, root, 1.0)
@@ -282,7 +282,7 @@ class RoadAligner:
         for _ in range(_READ_ROUNDS):
             u, v = cam.fx_px * (q[0] * by_z) + cam.cx_px, cam.fy_px * (q[1] * by_z) + cam.cy_px
             more = view.late - view.share * self._shutter.row(u, v)
-            q = begun + more * (shift + view.turning)
+            q = started + more * (shift + view.turning)
             by_z = 1.0 / np.maximum(q[2], _MIN_DEPTH)
         return _Places(q[0] * by_z, q[1] * by_z, by_z, rho, root, 1.0 + more)
 

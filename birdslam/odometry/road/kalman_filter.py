@@ -102,12 +102,12 @@ class RoadFilter:
         return H
 
     def reset_scale(self, sigma_rel: float) -> None:
-        """The unit of length is known to `sigma_rel`, whatever it was: the window began anew, or it is doubted."""
+        """The scale is known to `sigma_rel`, whatever it was: the window restarted, or it is doubted."""
         self.cov[0, :] = self.cov[:, 0] = 0.0
         self.cov[0, 0] = sigma_rel**2
 
     def inflate_scale(self, sigma_rel: float) -> None:
-        """The unit of length is known to `sigma_rel` at best."""
+        """The scale is known to `sigma_rel` at best."""
         self.cov[0, 0] = max(self.cov[0, 0], min(sigma_rel, 1.0) ** 2)
 
     def lose_tilt(self) -> None:
@@ -143,7 +143,7 @@ class RoadFilter:
             factor = cfg.car.factor_walk_rel_per_sqrt_m**2 * travelled_m
             noise += [factor, 0.0, (1.0 - lasts**2) * cfg.car.sigma_road_rel**2]
         self.cov = F @ self.cov @ F.T + np.diag(noise)
-        # In a turn landmarks leave the image at the side, and the unit of length drifts more
+        # In a turn landmarks leave the image at the side, and the scale drifts more
         turned_rad = float(np.arctan2(R_prev_curr[0, 2], R_prev_curr[2, 2]))
         bend_per_m = min(abs(turned_rad) / max(travelled_m, 0.1), cfg.max_bend_per_m)
         drift = cfg.scale_walk_rel_per_sqrt_m**2 + (cfg.scale_walk_bend_sqrt_m * bend_per_m) ** 2
@@ -282,7 +282,7 @@ class RoadFilter:
         self.x[CAR_DELAY] = np.clip(self.x[CAR_DELAY], -limit_s, limit_s)
         off = float(self.x[CAR_FACTOR])
         if abs(off) > _MAX_FACTOR_SIGMAS * self.config.car.sigma_factor_rel:
-            # No tyres are off by so much: the road's scale is (by night the car's own light moves along with it)
+            # No tyres are off by this amount: the road's scale is (by night the car's own light moves along with it)
             self.cov[ROAD_ERROR, ROAD_ERROR] += off**2
             H = np.zeros((1, len(self.x)))
             H[0, CAR_FACTOR] = 1.0

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 OTHER_LENGTHS_LOG = (-0.35, -0.2, 0.2, 0.35)  # over which a fit must be likelier
-_MAX_SHARE = 0.99  # of the gain, by which the width of the maximum can still be told
+_MAX_SHARE = 0.99  # of the gain, up to which the width of the maximum is observable
 _MIN_VARIANCE_RATIO = 1e-6  # of the variance that a correlation leaves
 
 

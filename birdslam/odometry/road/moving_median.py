@@ -32,7 +32,7 @@ _SIGMA_OF_MEDIAN = 1.4826 * 1.2533  # times the median absolute deviation over t
 class MovingMedianScale:
     """A `metric_scale.MetricScale`.
 
-    State: the last `median_frames` scales (metres per unit of length of the window as it began), and the last median.
+    State: the last `median_frames` scales (metres per scale of the window as it began), and the last median.
     Measurements: one scale a frame, from the window's landmarks on the road. Readers: `Odometry`.
     """
 
@@ -74,7 +74,7 @@ class MovingMedianScale:
         return self.sigma_rel > self.config.invalid_sigma_rel
 
     def restart(self, grey: NDArray[np.uint8], pose: Pose, sigma_rel: float) -> None:
-        """A new window has a new unit of length: the scales of the old one are dropped."""
+        """A new window has a new scale: the scales of the old one are dropped."""
         self._scales.clear()
         self._last_scale = 1.0
 
@@ -117,7 +117,7 @@ class MovingMedianScale:
         return self._last_scale / last
 
     def frame_scale(self, view: RoadView) -> float | None:
-        """Metres per present unit of length by this image's landmarks on the road; None where there are too few."""
+        """Metres per present scale by this image's landmarks on the road; None where there are too few."""
         config, window = self.config, view.window
         seen = np.isfinite(window.obs[-1, :, 0]) & (window.rho_sigma < config.median_sigma_depth_rel * window.rho)
         px = self.camera.to_px(window.obs[-1, seen])

@@ -95,13 +95,13 @@ class RoadScale:
         return self._filter.chord[1]
 
     def restart(self, grey: NDArray[np.uint8], pose: Pose, sigma_rel: float) -> None:
-        """The window begins anew with this image; its unit of length is known to `sigma_rel`."""
+        """The window restarts with this image; its scale is known to `sigma_rel`."""
         image = self._aligner.image(grey)
         self._obstructions.begin(grey)
         self._keyframes.clear()
         if not self._obstructions.fixed_pattern:
             self._keyframes.insert(RoadFrame(image, image), pose, 0.0)
-        if not self._confirmation.begun:
+        if not self._confirmation.started:
             sigma_rel = 1.0
         self._filter.reset_scale(sigma_rel)
         if sigma_rel > self.config.doubt_sigma_rel:
@@ -109,7 +109,7 @@ class RoadScale:
         self._car.restart()
 
     def speed_predicted(self, sigma_rel: float) -> None:
-        """The newest motion's length comes from the velocity prior, so the unit of length is known to `sigma_rel`."""
+        """The newest motion's length comes from the velocity prior, so the scale is known to `sigma_rel`."""
         self._filter.inflate_scale(sigma_rel)
         self._predicted = self._direction_predicted = True
 
@@ -133,7 +133,7 @@ class RoadScale:
     def measure_scale(self, step: Pose, view: RoadView) -> float:
         """The factor on all lengths, by the road in this image and an earlier one and by the car's own speed.
 
-        `step` is T_prev_curr, in the present unit of length.
+        `step` is T_prev_curr, in the present scale.
         """
         by_road = self._measure_road(step, view)
         self._car.rescale(by_road)
@@ -164,7 +164,7 @@ class RoadScale:
         if keyframe is not None:
             T = keyframe.pose.between(pose)
             share = self._readout_share(T, travelled_m, view)
-            if not self._was_known and not self._confirmation.begun and self.unknown:
+            if not self._was_known and not self._confirmation.started and self.unknown:
                 self._filter.initialise_pitch(T.R.T @ T.p, view.sigma_across_m)
             bend_per_m = _bend_per_m(step.R, travelled_m)
             wide = self._obstructions.fixed_pattern
@@ -211,14 +211,14 @@ class RoadScale:
 
     def _update_bonnet(self, view: RoadView, travelled_m: float) -> None:
         """Where a bonnet has been taken for road until it was found, scale and tilt are dropped."""
-        driven_m = travelled_m if self._confirmation.begun else None
+        driven_m = travelled_m if self._confirmation.started else None
         if self._obstructions.bonnet_changed(view.grey, driven_m, view.flow_px):
             self._filter.reset_scale(1.0)
             self._filter.lose_tilt()
             self._confirmation.forget()
 
     def _landmark_scale(self, window: SlidingWindow) -> float | None:
-        """Metres in the window's unit of length by its landmarks on the road, where the scale is doubtful."""
+        """Metres in the scale of the window by its landmarks on the road, where the scale is doubtful."""
         if not (self._is_doubtful() or self._confirmation.contradicted):
             return None
         return scale_from_landmarks(self.camera, self._tilt, window)
@@ -246,7 +246,7 @@ class RoadScale:
 
     def _sees_road(self) -> bool:
         seen = self._filter.carried_m <= self.config.carried_after_m and not self._predicted
-        return seen and self._confirmation.begun
+        return seen and self._confirmation.started
 
     def status(self) -> list[Status]:
         """What is wrong with the scale, the ground plane or the mount."""
@@ -301,7 +301,7 @@ class RoadScale:
         search = None
         if self._is_doubtful():
             # A confirmed scale must be beaten clearly: the dark below a car ahead correlates with standing still
-            lead = 0.02 if not confirmation.begun else 0.1
+            lead = 0.02 if not confirmation.started else 0.1
             search = LengthSearch(self._tilt, lead, cfg.sigma_unseen_rad if confirmation.doubted else 0.0)
         found = best_alignment(
             self._aligner, filter_, past, present, T, px, by_landmarks, sigma_motion, search, readout_share
@@ -311,10 +311,10 @@ class RoadScale:
         fit, searched, prior_cov = found
         known = confirmation.known or self._car.measures
         least = cfg.min_correlation
-        told = fit.length_information > cfg.doubt_sigma_rel**-2  # far likelier than other lengths
+        reported = fit.length_information > cfg.doubt_sigma_rel**-2  # far likelier than other lengths
         log_length = float(np.log(searched)) + float(fit.state[0])
         confirmed = (searched != 1.0 and confirmation.found_before(log_length)) or agrees(log_length, by_landmarks)
-        if told or confirmed:
+        if reported or confirmed:
             least *= _AGREED_CORRELATION_SHARE
         if searched == 1.0:
             expected = not known or filter_.innovation(fit)[2] < cfg.max_innovation_sigma

@@ -6,7 +6,7 @@ from birdslam.odometry.scale_config import RoadScaleConfig
 
 TOLD = 0.5  # of an alignment's information about the length (kalman_filter.py): with more it counts as told
 _COMPARISONS = 5  # time constant of the mean of what they tell
-_ANOTHER_LOG = 0.3  # of the factor on the length by an alignment: a larger one begins the row anew
+_ANOTHER_LOG = 0.3  # of the factor on the length by an alignment: a larger one begins the row again
 _MAX_AGAINST = 10.0  # alignments that agreed on the length before, which as many must outweigh
 _REMEMBERED, _FOUND = 20, 2  # rejected alignments, and how many of them must have found the same length
 _SAME_LOG = 0.2  # of two lengths that are the same
@@ -17,7 +17,7 @@ class ScaleConfirmation:
 
     def __init__(self, config: RoadScaleConfig) -> None:
         self.config = config
-        self._told = 0.0  # by alignments in a row, each 0 to 1
+        self._reported = 0.0  # by alignments in a row, each 0 to 1
         self._against = 0.0  # told of another length by those in a row before
         self._rejected = 0.0  # in a row, each by its new share of the path: those of one view err together
         self.rejections = 0  # their number
@@ -25,14 +25,14 @@ class ScaleConfirmation:
         self._mean, self._comparisons = 0.0, 0  # mean information of comparisons about the length, and their number
 
     @property
-    def begun(self) -> bool:
+    def started(self) -> bool:
         """Whether an alignment has told a length since it was last unknown."""
-        return self._told >= TOLD
+        return self._reported >= TOLD
 
     @property
     def known(self) -> bool:
         """Whether enough have."""
-        return self._told > self.config.confirmations - TOLD
+        return self._reported > self.config.confirmations - TOLD
 
     @property
     def outweighed(self) -> bool:
@@ -40,7 +40,7 @@ class ScaleConfirmation:
 
         Where the motion's direction is wrong no right length correlates, and a false one may for a while.
         """
-        return self._told < self._against
+        return self._reported < self._against
 
     @property
     def contradicted(self) -> bool:
@@ -59,7 +59,7 @@ class ScaleConfirmation:
 
     def forget(self) -> None:
         """The length is unknown."""
-        self._told = self._against = 0.0
+        self._reported = self._against = 0.0
         self._found = []
 
     def reject(self, new: float, found_log: float | None = None) -> None:
@@ -96,5 +96,5 @@ class ScaleConfirmation:
     def confirm(self, tells: float, log_factor: float) -> None:
         """It has changed the length by this factor."""
         if abs(log_factor) > _ANOTHER_LOG:
-            self._against, self._told = min(self._told, _MAX_AGAINST), 0.0
-        self._told += tells
+            self._against, self._reported = min(self._reported, _MAX_AGAINST), 0.0
+        self._reported += tells

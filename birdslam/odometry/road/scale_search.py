@@ -80,8 +80,8 @@ def best_alignment(
         if search.tilt_sigma_rad:
             loose[1:3, 1:3] += np.eye(2) * search.tilt_sigma_rad**2
         for start in (searched,) if by_landmarks is None else (searched, by_landmarks):
-            begun = Pose(T.R, T.p * start)
-            other = aligner.align(past, present, begun, px, prior, loose[:ROAD, :ROAD], sigma_motion, readout_share)
+            started = Pose(T.R, T.p * start)
+            other = aligner.align(past, present, started, px, prior, loose[:ROAD, :ROAD], sigma_motion, readout_share)
             if other is None:
                 continue
             log_length = float(np.log(start)) + other.state[0]
@@ -194,7 +194,7 @@ def correlations(
 
 
 def scale_from_landmarks(camera: Camera, tilt: tuple[float, float], window: SlidingWindow) -> float | None:
-    """Metres in the window's unit of length, by the mode of the camera's height over the landmarks on the road ahead.
+    """Metres in the scale of the window, by the mode of the camera's height over the landmarks on the road ahead.
 
     `tilt` is (pitch, roll) in rad. None where too few landmarks agree on one height.
     """

@@ -24,7 +24,7 @@ Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 
 _KERNELS = (16.0, 8.0, 4.0, 2.0, 2.0, 2.0, 2.0)  # in sigmas, one for each iteration
 _WIDE_SIGMAS = 8.0  # kernel of the residuals' spread
-_NOSE_UP_RAD = 0.05  # the search area includes the road with the nose up by so much
+_NOSE_UP_RAD = 0.05  # the search area includes the road with the nose up by this amount
 _MIN_BELOW = 0.02  # of a segment below the horizon, as a tangent
 _WIDTH_PX = 640  # about the width used, for time: larger images are halved
 

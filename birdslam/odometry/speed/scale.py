@@ -21,7 +21,7 @@ from birdslam.odometry.speed.readings import CarSpeedConfig, SpeedReadings
 from birdslam.types import NS_PER_S, SpeedReading, Status
 
 MOVING_M = 0.05  # from one image to the next: below it the car may stand
-_SAME_RATIO_STD = 0.04  # of log ratios in contradiction: below it the unit of length is wrong, not the readings
+_SAME_RATIO_STD = 0.04  # of log ratios in contradiction: below it the scale is wrong, not the readings
 _MOVING_SIGMAS = 4.0
 _RECENT_S = 2.0
 _CLOCK_TOLERANCE_S = 0.02  # by which the newest reading may be older than its image
@@ -68,8 +68,8 @@ class SpeedScale:
         self._road, self._filter = config, filter_
         self._speed = SpeedReadings(config.car)
         self._path: list[_PathSample] = []
-        self._road_confirmed = False  # the unit of length, by the road
-        self._settled = False  # the unit of length drifts slowly
+        self._road_confirmed = False  # the scale, by the road
+        self._settled = False  # the scale drifts slowly
         self._rejected: list[tuple[int, float]] = []  # (time, log ratio) since a distance agreed
         self._agreed_ns: int | None = None  # the end of the last distance that agreed
         self._mean_nis = 1.0  # running mean of the normalised innovation squared
@@ -117,7 +117,7 @@ class SpeedScale:
             self._agreements = 0
 
     def restart(self) -> None:
-        """The window begins anew, with a new unit of length."""
+        """The window restarts, with a new scale."""
         self._path = []
         self.since_m = math.inf
         self._window_m = 0.0
@@ -138,7 +138,7 @@ class SpeedScale:
     def update(self, from_ns: int, to_ns: int, forward: float, travelled: float, confirmed: bool) -> float:
         """The factor on all lengths, after a motion by images of `forward` along the car and `travelled` in all.
 
-        `confirmed`: the unit of length is known by the road.
+        `confirmed`: the scale is known by the road.
         """
         self.since_m += travelled
         self._window_m += travelled
@@ -207,7 +207,7 @@ class SpeedScale:
         return filter_.update_car_speed(log_ratio, by_delay, var)
 
     def _reject(self, t_ns: int, log_ratio: float) -> float:
-        """Keeps a distance that disagrees, and decides whether the readings or the unit of length are wrong."""
+        """Keeps a distance that disagrees, and decides whether the readings or the scale are wrong."""
         cfg = self.config
         if not self._rejected:
             self._rejected_m = 0.0

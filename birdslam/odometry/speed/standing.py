@@ -20,10 +20,10 @@ from birdslam.odometry.speed.zero_velocity import ZeroVelocityConfig, is_station
 Floats = NDArray[np.float64]
 
 _STILL_OUTER_PX = 1.5  # four of five corners have moved less where the median has not
-_MAX_HELD = 1.5  # times as long as a standstill takes to be told
-# A stop is told where the last speed would have moved the corners by so many times what counts as none; after so long
-# whatever the speed was. By judgement
-_CLEARLY, _TOLD_S = 3.0, 0.5
+_MAX_HELD = 1.5  # of the time that the detection of a standstill takes
+# A stop is detected if the last speed would have moved the corners by this multiple of the threshold of no motion, or
+# after this time whatever the speed was. By judgement
+_CLEARLY, _DETECTION_S = 3.0, 0.5
 _SPEED_MEMORY_S = 0.2  # of that speed: of one slow motion between two images half is noise
 
 
@@ -87,7 +87,7 @@ class StandingDetector:
 
         Over how long it was (s), and how much of it may be of the images before, in which nothing was seen to move (m).
         """
-        over_s, self._unmoved_s = min(self._unmoved_s + dt_s, max(_TOLD_S, dt_s)), 0.0
+        over_s, self._unmoved_s = min(self._unmoved_s + dt_s, max(_DETECTION_S, dt_s)), 0.0
         if len(displacement_px) and length_m > 0.0:
             outer_px = quantile(displacement_px, 0.8)
             if outer_px > _CLEARLY * self.config.still_px:
@@ -96,17 +96,17 @@ class StandingDetector:
         return over_s, length_m * (1.0 - dt_s / over_s)
 
     def stood(self, dt_s: float) -> float:
-        """One more image in which nothing moved: 1-sigma of the car's motion (m), 0 where it is told to stand.
+        """One more image in which nothing moved: 1-sigma of the car's motion (m), 0 where it is stationary.
 
         A car that creeps moves the corners in the image by less than counts as none, and in some more images by more.
         """
         self._unmoved_s += dt_s
         would_move_px = self._px_per_m * self._mps * self._unmoved_s
-        if self._px_per_m == 0.0 or self._unmoved_s > _TOLD_S or would_move_px > _CLEARLY * self.config.still_px:
+        if self._px_per_m == 0.0 or self._unmoved_s > _DETECTION_S or would_move_px > _CLEARLY * self.config.still_px:
             return 0.0
         unseen_m = self.config.still_px / self._px_per_m  # at the most, since the corners last moved
         return unseen_m * dt_s / self._unmoved_s / math.sqrt(3.0)
 
     def held_too_long(self, dt_s: float) -> bool:
-        """Whether a speed was held for longer than a standstill takes to be told: what moves has left the image."""
+        """Whether a speed was held for longer than the detection of a standstill takes."""
         return dt_s > _MAX_HELD * self.near_road.config.long_s

@@ -46,7 +46,7 @@ class StillnessConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     long_s: Positive = 1.0  # over which the image must not change
     short_s: Positive = 0.1  # over which it changes by noise
     growth: Positive = 2.5  # the former over the latter: above it the car moves
-    contrast_share: Positive = 0.15  # change over contrast: above it nothing is told
+    contrast_share: Positive = 0.15  # change over contrast, above which there is no evidence
 
 
 @dataclass(frozen=True)

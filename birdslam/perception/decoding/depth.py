@@ -21,7 +21,7 @@ class DepthMap:
     """`depth_m` (h, w) float32: depth along the optical axis, a positive finite number for every pixel.
 
     It lies over the whole undistorted image but may be coarser; `image_width_px`, `image_height_px` are the image's.
-    With `canonical_focal_rel` > 0 the numbers are those of a camera whose focal length is so many times its image's
+    With `canonical_focal_rel` > 0 the numbers are those of a camera whose focal length is this factor times its image's
     width: `in_metres` makes them the camera's own. Without `metric` they are known up to one factor, which the road
     gives (birdslam/vehicles/placement/pseudolidar.py).
     """

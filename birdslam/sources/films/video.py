@@ -111,7 +111,7 @@ class VideoRecording(Recording):
             position, shift_ns, t_ns = 0, begin_ns, last_ns
             while capture.grab():
                 stamp_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6) + shift_ns
-                if stamp_ns <= t_ns:  # a clock that began anew, or a container without times, which gives zeros
+                if stamp_ns <= t_ns:  # a clock that restarted, or a container without times, which gives zeros
                     shift_ns += t_ns + film.period_ns - stamp_ns
                     stamp_ns = t_ns + film.period_ns
                 gap_ns, t_ns = (stamp_ns - t_ns if index else 0), stamp_ns

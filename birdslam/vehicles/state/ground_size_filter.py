@@ -231,7 +231,7 @@ class GroundSizeFilter:
         `outlines_m` and `extents_m` (N,): what each class measures across and along the line of sight at its yaw;
         `turned_rad` (N,): by how much that line turned since last seen. Observations are against the present `ground`.
         `learned` (N, K), sizes by parallax, counts in the depths that are returned and is not kept: the parallax filter
-        gives it anew in each frame.
+        gives it again in each frame.
         """
         n = len(seen)
         if not n:
@@ -262,10 +262,10 @@ class GroundSizeFilter:
         )
 
     def _outline_drift(self, rows: Sequence[int], turned_rad: Floats, learned: LearnedSize | None) -> Floats:
-        """(N,): by how much the variance of each log outline grew since it was last seen.
+        """Returns (N,) the growth of the variance of each log outline since it was last seen.
 
-        The line of sight to what stands turns by what the ego drives; who drives turns by itself too, the more the
-        faster. A car that is seen from behind doubles its outline within 30 degrees.
+        The line of sight turns with the ego motion, and for a moving vehicle with its own speed. The outline of a
+        car that is seen from behind doubles within 30 degrees.
         """
         config = self.config
         own_turn = 0.0 if learned is None else config.bend_per_m * learned.speed_mps  # in a second

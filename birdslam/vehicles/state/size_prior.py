@@ -96,7 +96,7 @@ class SizePrior:
 
 
 def _informed(x: Floats, P: Floats, at: tuple[int, int], mean: float, information: float) -> tuple[Floats, Floats]:
-    """By so much more information that log h less `common` is `mean` (Sherman, Morrison)."""
+    """Adds the information that log h minus `common` is `mean` (Sherman-Morrison)."""
     of_height, common = at
     Pa = P[:, of_height] - P[:, common]
     gain = Pa * (information / (1.0 + information * (Pa[of_height] - Pa[common])))

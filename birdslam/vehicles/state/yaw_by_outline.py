@@ -24,7 +24,7 @@ Floats = NDArray[np.float64]
 _MIN_DT_S = 1e-3
 _UNSEEN_RAD = math.pi  # 1-sigma of the way's heading before a vehicle is seen
 NEIGHBOURS = 2  # bins on both sides of the likeliest that are one mode with it
-SURER = 2.0  # so many times the probability has another mode, before the yaw changes to it
+SURER = 2.0  # ratio of probabilities at which the yaw changes to another mode
 
 
 class YawByOutline:

@@ -1,7 +1,7 @@
 """A night without street lamps: two low beams light the road, others' lamps are bright spots; numpy and OpenCV.
 
 The scene is rendered in even light first (`even_sky`): that is how bright each pixel's surface is, and with its depth
-it is lit here anew. Luminance is in cd/m^2. Paint with glass beads sends the beam back to the car: 0.15 cd/(m^2 lx),
+it is lit here again. Luminance is in cd/m^2. Paint with glass beads sends the beam back to the car: 0.15 cd/(m^2 lx),
 bare asphalt a tenth of that (EN 1436, Table 3); most of what a driver sees of a dry road at night is that.
 """
 

@@ -102,7 +102,7 @@ class Trainer:
         self.optimiser.load_state_dict(state["optimiser"])
 
     def begin(self, *states: dict[str, Any]) -> None:
-        """Takes over the weights of others' states, as far as they have them; the optimiser begins anew.
+        """Takes over the weights of others' states, as far as they have them; the optimiser restarts.
 
         Of several it is the mean of their weights: where runs began with the same weights, noise is what differs at
         their ends, and the mean has less of it (Wortsman et al. 2022). Raises ValueError where they have weights that

@@ -1,4 +1,4 @@
-"""`birdslam demo-drive make`: the shipped drive, rendered anew."""
+"""`birdslam demo-drive make`: the shipped drive, rendered again."""
 
 from __future__ import annotations
 

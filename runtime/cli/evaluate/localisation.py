@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--mode", choices=("default", "paper"), default="default", help="paper: Eq. 1 on level ground")
     text = "the road's pitch: with the images' error of it, as odometry on images reports it, or none"
     parser.add_argument("--tilt", choices=("images", "none"), default="images", help=text)
-    text = "how often the tilt's error is drawn anew; all draws count together"
+    text = "how often the tilt's error is drawn again; all draws count together"
     parser.add_argument("--draws", type=int, default=1, metavar="N", help=text)
     text = "of whom; cyclists by boxes of the labels' hulls, with the noise of real ones"
     parser.add_argument("--class", dest="kind", choices=("car", *PEOPLE), default="car", help=text)
@@ -118,7 +118,7 @@ def _places(row: PeopleRow | LocalisationRow) -> str:
 
 def _table_of_people(rows: Sequence[PeopleRow]) -> str:
     titles = f"{_PLACES}{'walking':>9}{'away':>7}{'across':>8}{'standing':>9}"
-    lines = [f"{'sequence':11}{'range m':>9}{'n':>7}{titles}  (m/s: error of who walks, speed of who stands)"]
+    lines = [f"{'sequence':11}{'range m':>9}{'n':>7}{titles}  (m/s: error of walking people, speed of standing people)"]
     for row in rows:
         parts = (row.walking_along_ray_median_mps, "7.2f"), (row.walking_across_ray_median_mps, "8.2f")
         speeds = (row.walking_speed_error_median_mps, "9.2f"), *parts, (row.standing_speed_median_mps, "9.2f")

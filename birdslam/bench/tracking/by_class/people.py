@@ -34,7 +34,7 @@ from birdslam.vehicles.placement.localisation import iou
 
 PEOPLE = ("pedestrian", "cyclist")
 RANGES_M = ((5.0, 15.0), (15.0, 30.0), (30.0, 50.0))
-WALKING_MPS, STANDING_MPS = 0.5, 0.2  # true speeds: of who walks, and of who stands
+WALKING_MPS, STANDING_MPS = 0.5, 0.2  # true speeds: of walking and of standing people
 TRUTH_S = 0.5  # a label's speed is its places' of so long before and after
 MATCH_IOU = 0.4  # of a box with the label's, in the image
 STANDING_EGO = ("0012", "0016", "0017")  # the ego stands, or nearly
