@@ -1,4 +1,4 @@
-"""How far a drive is to be believed: every status has its words, and the sentences never say more than is true."""
+"""The verdict on a drive: every status has a meaning, and no sentence claims more than the counts show."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def drive(frames: int = 100, invalid: int = 0, **more: object) -> DriveCounts:
     return DriveCounts(frames=frames, invalid_frames=invalid, **{**plain, **more})  # type: ignore[arg-type]
 
 
-def test_every_status_has_plain_words() -> None:
+def test_every_status_has_a_meaning() -> None:
     assert set(MEANINGS) == set(Status)
     for words in (*MEANINGS.values(), *REMEDIES.values()):
         assert 5 < len(words) < 110
@@ -43,34 +43,34 @@ def test_the_share_is_100_percent_only_where_all_is_valid_and_0_only_where_nothi
     invalid = data.draw(st.integers(0, frames))
     first, *_ = verdict(drive(frames, invalid))
     if not frames:
-        assert first.startswith("There is nothing")
+        assert first.startswith("No frame was processed")
     elif not invalid:
         assert first.startswith(f"All {frames} frames")
     elif invalid == frames:
-        assert first.startswith("None of it")
+        assert first.startswith("No frame is valid")
     else:
         share = int(first.split()[0])
         assert 1 <= share <= 99
         assert share == pytest.approx(100.0 * (frames - invalid) / frames, abs=1.0)
 
 
-def test_a_film_that_was_cut_off_is_told_in_one_sentence() -> None:
+def test_a_film_that_was_cut_off_is_reported_once() -> None:
     assert sum("cut off" in said for said in verdict(drive(100, 1, ends_unreadable=True))) == 1
     assert not any("cut off" in said for said in verdict(drive(100, 1, invalid_by={"frame_unreadable": 1})))
 
 
-def test_what_is_not_valid_is_told_with_its_reason_the_most_frequent_first() -> None:
+def test_reasons_are_listed_by_frequency() -> None:
     said = verdict(drive(100, 30, invalid_by={"camera_dark": 5, "scale_invalid": 30}, statuses={"scale_invalid": 30}))
     reasons = [line for line in said if line.startswith("Not valid")]
     assert [line.split()[2] for line in reasons] == ["30", "5"]
-    assert "how long a metre is" in reasons[0]
-    assert any("--speed FILE" in line for line in said)  # a remedy, since it was often so
+    assert "determine the scale" in reasons[0]
+    assert any("--speed FILE" in line for line in said)
 
 
 def test_an_unmeasured_height_is_the_next_thing_to_measure() -> None:
     by_cars = LengthsBy("the camera's height of 1.40 m (by the size of 12 cars, +- 11%)", 0.11)
     said = verdict(drive(scale_sigma_rel=0.12, camera_sigma_rel=0.11, lengths_by=by_cars))
-    assert any("Lengths are known to 12%" in line and by_cars.words in line for line in said)
+    assert any("Lengths are accurate to 12%" in line and by_cars.words in line for line in said)
     (step,) = [line for line in said if line.startswith("Next")]
     assert "--height M" in step
     assert "5 % of height is 5 % of all lengths" in step
@@ -79,16 +79,16 @@ def test_an_unmeasured_height_is_the_next_thing_to_measure() -> None:
     assert "--fov DEG" in step
     said = verdict(drive(camera_sigma_rel=0.25, lengths_by=stated._replace(view_is_stated=True)))
     (step,) = [line for line in said if line.startswith("Next")]
-    assert step.startswith("Next: photograph a chessboard")  # who has stated the view is not asked for it
+    assert step.startswith("Next: photograph a chessboard")
     both = LengthsBy("both", 0.1, 0.25)
     first, second = [line for line in verdict(drive(camera_sigma_rel=0.27, lengths_by=both)) if line.startswith("Next")]
-    assert "--fov" in first  # what is least known
+    assert "--fov" in first
     assert "--height" in second
 
 
 def test_the_readme_names_each_file() -> None:
-    text = readme("drive", ["All 3 frames are valid."], {"bev.png": "from above", "tracks": "the vehicles"})
-    assert "All 3 frames are valid." in text
+    text = readme("drive", ["All 3 frames are valid (2 m)."], {"bev.png": "from above", "tracks": "the vehicles"})
+    assert "All 3 frames are valid (2 m)." in text
     assert text.index("bev.png") < text.index("tracks")
     assert text.endswith("\n")
 
@@ -124,5 +124,5 @@ def test_an_unsure_scale_moves_everything_along_its_own_place(
     assert np.reshape(seen.velocity_cov, (2, 2)) == pytest.approx(np.outer(u, u), rel=1e-9, abs=1e-12)
 
 
-def test_no_status_that_is_only_told_makes_a_frame_invalid() -> None:
+def test_an_informative_status_does_not_invalidate_a_frame() -> None:
     assert Status.SCALE_ESTIMATED not in INVALIDATING

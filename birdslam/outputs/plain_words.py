@@ -1,4 +1,4 @@
-"""How far a drive's results are to be believed, in sentences for somebody who has read no page of ours."""
+"""The verdict on a drive: which frames are valid, why the others are not, and how exact the lengths are."""
 
 from __future__ import annotations
 
@@ -8,69 +8,69 @@ from typing import NamedTuple
 
 from birdslam.types import INVALIDATING, SpeedSource, Status
 
-# What each status means for a person; status.py says it for a planner
+# What each status means, for people; status.py defines it for planners
 MEANINGS: Mapping[Status, str] = {
     Status.END_OF_SOURCE: "the film or the camera has ended",
-    Status.FRAME_UNREADABLE: "the picture is damaged or missing",
-    Status.FRAMES_DROPPED: "pictures before this one are missing",
-    Status.CAMERA_FROZEN: "the camera shows the very same picture again",
-    Status.CAMERA_DARK: "it is too dark, or the picture has hardly any contrast",
-    Status.LOW_TEXTURE: "hardly anything in the picture can be followed",
-    Status.ODOMETRY_COASTING: "the motion is guessed from the moment before, not seen",
-    Status.SCALE_CARRIED: "the road is hidden: the length of a metre is kept from before",
-    Status.SCALE_INVALID: "the road shows too little to know how long a metre is, or has not shown it for long",
-    Status.MOTION_IMPLAUSIBLE: "the motion that was seen is none that a car makes",
-    Status.STANDSTILL: "the car stands",
-    Status.GROUND_VIOLATED: "the road is not as flat as it is taken for",
-    Status.CAR_SPEED_LATE: "the car's own speed came late",
-    Status.CAR_SPEED_MISSING: "the car's own speed is missing",
-    Status.CAR_SPEED_IMPLAUSIBLE: "the car's own speed contradicts the pictures, and was left out",
-    Status.CAR_SPEED_FROZEN: "the car's own speed is stuck at one number, and was left out",
-    Status.VIEW_OBSTRUCTED: "something before the camera moves with it (bonnet, caption, drops): that part is left out",
-    Status.CALIBRATION_DRIFT: "the cars seen, or the road, contradict the camera's height or tilt",
-    Status.DETECTIONS_CARRIED: "the boxes are those of an earlier picture",
-    Status.SEGMENTATION_CARRIED: "the road's outline is that of an earlier picture",
-    Status.DEPTH_CARRIED: "the depths are those of an earlier picture",
-    Status.LANES_CARRIED: "the lanes are those of an earlier picture",
-    Status.PROVIDER_MISSING: "a network runs on the processor: its accelerator is not there, or failed",
-    Status.NETWORK_FAILED: "a network gave no numbers",
-    Status.INPUT_STALE: "something came late",
-    Status.DEGRADED_RATE: "the computer is too slow: it looks for vehicles less often",
-    Status.DEGRADED_BOXES: "the computer is too slow: it looks for vehicles only",
-    Status.DEGRADED_ODOMETRY: "the computer is too slow: it looks for no vehicles",
-    Status.COASTING: "the computer is too slow: this picture was passed over",
-    Status.COASTED_TOO_LONG: "the computer is too slow: no picture was looked at for too long",
-    Status.PERCEPTION_LATE: "the pictures' answer is late",
-    Status.GRAPH_RESET: "the way restarts here, at an unknown distance from before",
-    Status.GRAPH_RESTORED: "a part of the program was restarted, and goes on where it was",
-    Status.NOT_INITIALISED: "no motion has been seen yet",
-    Status.SCALE_ESTIMATED: "the camera's height or lens is an estimate, and so are all lengths",
-    Status.UNKNOWN: "something that this version does not know",
+    Status.FRAME_UNREADABLE: "the image is damaged or missing",
+    Status.FRAMES_DROPPED: "images before this one are missing",
+    Status.CAMERA_FROZEN: "the camera repeats the same image",
+    Status.CAMERA_DARK: "the image is too dark or has hardly any contrast",
+    Status.LOW_TEXTURE: "the image has too few features to track",
+    Status.ODOMETRY_COASTING: "the motion is predicted, not measured",
+    Status.SCALE_CARRIED: "the road is hidden, and the scale is kept from earlier frames",
+    Status.SCALE_INVALID: "the road has shown too little to determine the scale",
+    Status.MOTION_IMPLAUSIBLE: "the measured motion is impossible for a car",
+    Status.STANDSTILL: "the car is stationary",
+    Status.GROUND_VIOLATED: "the road is not as flat as the model assumes",
+    Status.CAR_SPEED_LATE: "the speed of the car arrived late",
+    Status.CAR_SPEED_MISSING: "the speed of the car is missing",
+    Status.CAR_SPEED_IMPLAUSIBLE: "the speed of the car contradicts the images and was not used",
+    Status.CAR_SPEED_FROZEN: "the speed of the car does not change and was not used",
+    Status.VIEW_OBSTRUCTED: "a part of the view moves with the camera (bonnet, caption, drops) and is ignored",
+    Status.CALIBRATION_DRIFT: "vehicles or the road contradict the height or tilt of the camera",
+    Status.DETECTIONS_CARRIED: "the boxes are those of an earlier image",
+    Status.SEGMENTATION_CARRIED: "the road mask is that of an earlier image",
+    Status.DEPTH_CARRIED: "the depths are those of an earlier image",
+    Status.LANES_CARRIED: "the lanes are those of an earlier image",
+    Status.PROVIDER_MISSING: "a network runs on the processor, because its accelerator is missing or failed",
+    Status.NETWORK_FAILED: "a network returned no finite numbers",
+    Status.INPUT_STALE: "an input arrived late",
+    Status.DEGRADED_RATE: "the computer is too slow, and the detector runs less often",
+    Status.DEGRADED_BOXES: "the computer is too slow, and only the detector runs",
+    Status.DEGRADED_ODOMETRY: "the computer is too slow, and no network runs",
+    Status.COASTING: "the computer is too slow, and this image was skipped",
+    Status.COASTED_TOO_LONG: "the computer is too slow, and images were skipped for too long",
+    Status.PERCEPTION_LATE: "the measurements of this image are late",
+    Status.GRAPH_RESET: "the trajectory restarts here, at an unknown distance from the part before",
+    Status.GRAPH_RESTORED: "a process was restarted and continues from its checkpoint",
+    Status.NOT_INITIALISED: "no motion has been measured yet",
+    Status.SCALE_ESTIMATED: "the height or the lens of the camera is an estimate, and so are all lengths",
+    Status.UNKNOWN: "the status is unknown to this version",
 }
 
-# What to do about a status that stood on many frames
+# The remedy for a status of many frames
 REMEDIES: Mapping[Status, str] = {
-    Status.CAMERA_DARK: "film by daylight",
-    Status.SCALE_INVALID: "the car's own speed or a GPS track (--speed FILE) gives the metres where the road does not",
-    Status.CALIBRATION_DRIFT: "measure the camera's height again, and see whether it sits firmly",
-    Status.FRAME_UNREADABLE: "copy the film again, or have it re-encoded",
-    Status.CAMERA_FROZEN: "a film with each picture twice: take every second one (--stride 2)",
-    Status.COASTED_TOO_LONG: "take every frame, however long it takes (--rate max)",
-    Status.CAR_SPEED_IMPLAUSIBLE: "see whether the times of the speed file are those of the film",
+    Status.CAMERA_DARK: "record in daylight",
+    Status.SCALE_INVALID: "give the speed of the car or a GPS track (--speed FILE)",
+    Status.CALIBRATION_DRIFT: "measure the height of the camera again and check its mount",
+    Status.FRAME_UNREADABLE: "copy the film again or re-encode it",
+    Status.CAMERA_FROZEN: "if the film has each image twice, read every second one (--stride 2)",
+    Status.COASTED_TOO_LONG: "process every frame, slower than real time (--rate max)",
+    Status.CAR_SPEED_IMPLAUSIBLE: "check that the speed file and the film use the same clock",
 }
-WORTH_MEASURING_REL = 0.04  # a tape and a lens' data sheet are better than this
-OFTEN = 0.2  # of the frames: then a status is worth a remedy
-WORTH_TELLING = (Status.CALIBRATION_DRIFT, Status.SCALE_ESTIMATED, Status.VIEW_OBSTRUCTED, Status.STANDSTILL)
+WORTH_MEASURING_REL = 0.04  # a tape measure or a data sheet is better than this
+OFTEN = 0.2  # share of the frames from which on a remedy is given
+REPORTED = (Status.CALIBRATION_DRIFT, Status.SCALE_ESTIMATED, Status.VIEW_OBSTRUCTED, Status.STANDSTILL)
 
 
 class LengthsBy(NamedTuple):
-    """What the metres of a camera rest on: in words, and 1-sigma of all lengths by its height and its focal length."""
+    """What the scale rests on, and the 1-sigma of all lengths due to the camera height and the focal length."""
 
-    words: str = "the camera's height and lens, as its camera file or the recording states them"
+    words: str = "the height and lens of the camera, as the camera file or the recording states them"
     height_sigma_rel: float = 0.0
     focal_sigma_rel: float = 0.0
-    contradicted_by: str = ""  # what says another height than the one that was stated, and which
-    view_is_stated: bool = False  # how wide the camera sees, which leaves the focal length as sure as it is
+    contradicted_by: str = ""  # the evidence for another height than the stated one
+    view_is_stated: bool = False  # the field of view was given
 
 
 AS_STATED = LengthsBy()
@@ -78,46 +78,46 @@ AS_STATED = LengthsBy()
 
 @dataclass(frozen=True, kw_only=True)
 class DriveCounts:
-    """What the verdict is made of; all of one drive."""
+    """The counts of one drive that the verdict is made of."""
 
     frames: int
     invalid_frames: int
-    invalid_by: Mapping[str, int]  # of the invalid frames, how many had each status that makes one invalid
+    invalid_by: Mapping[str, int]  # invalid frames by status
     statuses: Mapping[str, int]
     speed_sources: Mapping[str, int]
     path_m: float
     valid_path_m: float
     scale_sigma_rel: float | None  # median of the valid frames
-    camera_sigma_rel: float  # of that, by the camera's height and lens
-    lengths_by: LengthsBy = AS_STATED  # otherwise where a first pass found them
-    ends_unreadable: bool = False  # its last picture was damaged or missing
+    camera_sigma_rel: float  # its part due to camera height and lens
+    lengths_by: LengthsBy = AS_STATED
+    ends_unreadable: bool = False  # the last image is damaged or missing
 
 
 def verdict(drive: DriveCounts) -> list[str]:
-    """A sentence each: what share is valid, why the rest is not, how sure the metres are, what to do next."""
+    """Returns sentences: the share of valid frames, why others are not, how exact lengths are, what to do next."""
     return [*_validity(drive), *_lengths(drive), *_next_steps(drive)]
 
 
 def _validity(drive: DriveCounts) -> Iterable[str]:
     valid = drive.frames - drive.invalid_frames
     if not drive.frames:
-        yield "There is nothing to believe: no frame came through."
+        yield "No frame was processed."
         return
     if not valid:
-        yield f"None of it can be believed: not one of {drive.frames} frames is valid."
+        yield f"No frame is valid (0 of {drive.frames})."
     elif valid == drive.frames:
-        yield f"All {valid} frames are valid, over {drive.path_m:.0f} m."
+        yield f"All {valid} frames are valid ({drive.path_m:.0f} m)."
     else:
         share = _share(valid, drive.frames)
-        yield f"{share} is valid: {valid} of {drive.frames} frames, over {drive.valid_path_m:.0f} m."
+        yield f"{share} of frames are valid ({valid} of {drive.frames}, {drive.valid_path_m:.0f} m)."
     for name, frames in sorted(drive.invalid_by.items(), key=lambda item: -item[1]):
-        yield f"Not valid: {_frames(frames)}, since {meaning(name)} ({name})."
+        yield f"Not valid: {_frames(frames)}, because {meaning(name)} ({name})."
     if drive.ends_unreadable:
-        yield "It ends with a picture that is damaged or missing: the film was cut off there, and may have gone on."
-    for status in WORTH_TELLING:
+        yield "The last image is damaged or missing. The film was cut off there."
+    for status in REPORTED:
         frames = drive.statuses.get(status.value, 0)
         if frames and status not in INVALIDATING:
-            yield f"On {_frames(frames)} {MEANINGS[status]} ({status.value})."
+            yield f"{_frames(frames).capitalize()}: {MEANINGS[status]} ({status.value})."
 
 
 def _lengths(drive: DriveCounts) -> Iterable[str]:
@@ -126,15 +126,15 @@ def _lengths(drive: DriveCounts) -> Iterable[str]:
     by = drive.lengths_by.words
     by_car = drive.speed_sources.get(SpeedSource.CAR.value, 0)
     if by_car:
-        by += f", on {_share(by_car, drive.frames)} of the frames on the car's own speed"
-    yield f"Lengths are known to {drive.scale_sigma_rel:.0%} (1 sigma; twice that is all but sure). They rest on {by}."
+        by += f"; for {_share(by_car, drive.frames)} of the frames on the speed of the car"
+    yield f"Lengths are accurate to {drive.scale_sigma_rel:.0%} (1 sigma). They rest on {by}."
     if drive.lengths_by.contradicted_by:
         yield (
-            f"The stated height (or lens) is contradicted: {drive.lengths_by.contradicted_by}. "
-            "One of them is wrong; the sigma covers both."
+            f"The stated height or lens is contradicted: {drive.lengths_by.contradicted_by}. "
+            "Measure it again; the sigma covers both values."
         )
     if not drive.camera_sigma_rel:
-        yield "In that the height counts as exact: an error of 5 % in it is an error of 5 % in all lengths."
+        yield "This takes the height as exact: an error of 5 % in the height is an error of 5 % in all lengths."
 
 
 def _next_steps(drive: DriveCounts) -> Iterable[str]:
@@ -142,26 +142,25 @@ def _next_steps(drive: DriveCounts) -> Iterable[str]:
     advice = [
         (
             height_rel,
-            "measure how high the camera stands over the road, to 2 cm, and give it (--height M): 5 % of height is 5 % "
-            "of all lengths.",
+            "measure the height of the camera above the road (--height M): 5 % of height is 5 % of all lengths.",
         ),
         (
             focal_rel,
-            ("" if drive.lengths_by.view_is_stated else "say how wide the camera sees (--fov DEG), or ")
+            ("" if drive.lengths_by.view_is_stated else "give the field of view (--fov DEG), or ")
             + "photograph a chessboard (birdslam calibrate --chessboard): "
             "5 % of focal length is 5 % of lengths along the road.",
         ),
     ]
-    for sigma_rel, words in sorted(advice, reverse=True):  # what is least known comes first
+    for sigma_rel, words in sorted(advice, reverse=True):  # the largest first
         if sigma_rel > WORTH_MEASURING_REL:
             yield f"Next: {words}"
     for status, remedy in REMEDIES.items():
         if drive.statuses.get(status.value, 0) > OFTEN * drive.frames:
-            yield f"Against {status.value}: {remedy}."
+            yield f"Remedy for {status.value}: {remedy}."
 
 
 def meaning(status: str) -> str:
-    """The plain words of a status by its name."""
+    """Returns the meaning of a status."""
     return MEANINGS[Status(status)]
 
 
@@ -170,12 +169,12 @@ def _frames(count: int) -> str:
 
 
 def _share(part: int, whole: int) -> str:
-    """As a percentage; neither 0 nor 100 % where that is not the whole truth."""
+    """Returns a percentage that is 0 or 100 % only if exactly so."""
     return f"{min(max(round(100.0 * part / max(whole, 1)), part > 0), 100 - (part < whole))} %"
 
 
 def readme(name: str, sentences: Sequence[str], files: Mapping[str, str]) -> str:
-    """The text that lies beside a drive's results: the verdict, and what each file is."""
+    """Returns the README.txt of a drive: the verdict and the meaning of each file."""
     width = max(map(len, files), default=0)
-    lines = [f"Results of BirdSLAM: {name}", "", *sentences, "", "The files here:", ""]
+    lines = [f"Results of BirdSLAM: {name}", "", *sentences, "", "Files:", ""]
     return "\n".join([*lines, *(f"  {file:<{width}}  {what}" for file, what in files.items()), ""])
