@@ -22,9 +22,10 @@ from birdslam.odometry.external import ExternalConfig
 from birdslam.odometry.odometry import Motion, Odometry, OdometryConfig
 from birdslam.odometry.plausibility import PlausibilityConfig, PlausibilityGate
 from birdslam.people.people_records import followed_people
-from birdslam.people.people_tracker import PeopleTracker, PeopleTrackingConfig
+from birdslam.people.people_tracker import FIRST_PERSON, PeopleTracker, PeopleTrackingConfig
 from birdslam.perception import Perception
 from birdslam.types import (
+    NS_PER_S,
     EgoEdge,
     Frame,
     Ground,
@@ -46,6 +47,7 @@ from birdslam.vehicles.track import EgoFrame, TrackingConfig
 from birdslam.vehicles.tracking import Tracker
 from birdslam.vehicles.vehicle_edges import vehicle_edges
 
+MAX_GAP_NS = 5 * NS_PER_S  # between two frames; tracks and velocities say nothing about a later time
 MEASURED_SIGMA_REL = 0.05  # a height or lens that is known better counts as measured
 
 
@@ -109,9 +111,21 @@ class FrontEnd:
         self.camera = camera
         self.config = config
         self.odometry: EgoMotion = odometry or Odometry(camera, config.odometry)
+        self._frustum_network = frustum_network
+        self.height = CameraHeightEstimator(camera, config.height, config.localisation)
+        self._lanes = LaneMapper(camera, config.static_map, config.lanes, config.lane_edges, lane_head)
+        estimated = camera.scale_sigma_rel > MEASURED_SIGMA_REL
+        self._scale_status = (Status.SCALE_ESTIMATED,) if estimated else ()
+        self._last_frame: int | None = None
+        self._last_t_ns = 0
+        self._start()
+
+    def _start(self, first_vehicle: int = 0, first_person: int = FIRST_PERSON) -> None:
+        """Starts all that predicts over time; new road users get ids from these on."""
+        camera, config = self.camera, self.config
         self._dead_reckoning = DeadReckoning(camera, config.static_map.attitude_memory_m)
         self._plausibility = PlausibilityGate(config.plausibility)
-        self.people = PeopleTracker(camera, config.people)
+        self.people = PeopleTracker(camera, config.people, first_person)
         self.vehicles = OutOfSequenceTracker(
             Tracker(
                 camera,
@@ -119,16 +133,12 @@ class FrontEnd:
                 config.localisation,
                 GroundSizeFilter(camera, config.ground_size),
                 config.pseudolidar,
-                frustum_network,
+                self._frustum_network,
+                first_vehicle,
             ),
             config.out_of_sequence,
             (self.people,),
         )
-        self.height = CameraHeightEstimator(camera, config.height, config.localisation)
-        self._lanes = LaneMapper(camera, config.static_map, config.lanes, config.lane_edges, lane_head)
-        estimated = camera.scale_sigma_rel > MEASURED_SIGMA_REL
-        self._scale_status = (Status.SCALE_ESTIMATED,) if estimated else ()
-        self._last_frame: int | None = None
         self._present = EgoFrame(-1, 0, SE2())
         self._last = 0, 0.0, SE2()  # when, the camera's pitch against the level, and T_world_ego
 
@@ -178,9 +188,25 @@ class FrontEnd:
         return self._lanes.view(self._dead_reckoning.T_world_ego)
 
     def _dropped(self, frame: Frame) -> tuple[Status, ...]:
-        gap = self._last_frame is not None and frame.frame_id > self._last_frame + 1
-        self._last_frame = frame.frame_id
-        return (Status.FRAMES_DROPPED,) if gap else ()
+        """Reports missing frames; restarts after a gap in time, over which no filter can predict.
+
+        A clock that was set back is a gap too, except where a looped source restarts, whose frame numbers fall.
+        """
+        last, self._last_frame = self._last_frame, frame.frame_id
+        since_ns, self._last_t_ns = frame.t_source_ns - self._last_t_ns, frame.t_source_ns
+        if last is None or frame.frame_id <= last:
+            return ()
+        gap = not 0 <= since_ns <= MAX_GAP_NS
+        if gap:
+            self._restart()
+        return (Status.FRAMES_DROPPED,) if gap or frame.frame_id > last + 1 else ()
+
+    def _restart(self) -> None:
+        """Starts a new epoch: this frame has no edge to an earlier one, and all tracks are dropped."""
+        if isinstance(self.odometry, Odometry):
+            self.odometry.reset()
+        self._lanes.clear()
+        self._start(self.vehicles.tracker.next_id, self.people.next_id)
 
     def _move(self, frame: Frame, tracks: Any, perception: Perception) -> tuple[Motion | None, EgoEdge | None]:
         """The ego's motion in metres and its CC edge; None where no motion to an earlier frame is known."""

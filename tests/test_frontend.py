@@ -1,5 +1,6 @@
 """The front end: motions chained, edges that name their frames, and what it says when there is nothing to say."""
 
+import dataclasses
 import math
 from typing import Any
 
@@ -11,11 +12,14 @@ from birdslam.frontend import FrontEnd, FrontEndConfig
 from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera, GroundPlane, VerticalCurvature
 from birdslam.geometry.se2 import SE2
+from birdslam.graph.graph_config import GraphConfig
+from birdslam.graph.pose_graph import PoseGraph
+from birdslam.graph.weights import WeightsConfig
 from birdslam.lanes.amodal.lane_mapper import LaneMapper
 from birdslam.odometry.dead_reckoning import DeadReckoning
 from birdslam.odometry.odometry import Motion
 from birdslam.perception import Detections, Perception, Ready, Segmentation
-from birdslam.types import Frame, Measurements, Status
+from birdslam.types import NS_PER_S, Frame, Measurements, Status
 
 CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65, pitch_rad=0.01)
 IMAGE = np.zeros((375, 1242), np.uint8)
@@ -239,3 +243,25 @@ def test_vehicles_and_lanes_have_one_vertical_curvature(monkeypatch: pytest.Monk
     frontend = FrontEnd(CAMERA, FrontEndConfig(), ScriptedOdometry({}))
     frontend.measure(Frame(0, 0, 0, 0, IMAGE), Ready(Perception(None, None, {}, ())))
     assert frontend.vehicles.road.vertical_per_m == pytest.approx(crest.per_m, rel=0.1)
+
+
+@pytest.mark.parametrize("gap_s", [300.0, 86_400.0, 1.6e9, -5.0, -1.6e9])
+def test_no_filter_predicts_across_a_gap_in_time(gap_s: float) -> None:
+    """A bag that pauses, or whose clock is set: the drive goes on, and a new road user gets a new id."""
+    box = [550.0, 180.0, 650.0, 260.0]
+    script = {k: motion(k, SE2(0.5, 0.0, 0.0)) for k in (*range(1, 8), *range(9, 16))}
+    front = FrontEnd(CAMERA, FrontEndConfig(), ScriptedOdometry(script))
+    graph = PoseGraph(GraphConfig(), WeightsConfig())
+    out, estimates = [], []
+    for k in range(16):
+        moved_ns = round(gap_s * NS_PER_S) if k >= 8 else 0
+        out.append(front.measure(dataclasses.replace(frame(k), t_source_ns=k * 10**8 + moved_ns), seeing(box)))
+        estimates.append(graph.optimise(out[-1]))
+    assert Status.FRAMES_DROPPED in out[8].status
+    assert not out[8].cv
+    assert out[8].cc is None
+    assert [len(m.cv) for m in out[10:]] == [1] * 6
+    assert {edge.vehicle for m in out[:8] for edge in m.cv}.isdisjoint(edge.vehicle for m in out[8:] for edge in m.cv)
+    assert estimates[-1].epoch == estimates[7].epoch + 1
+    for vehicle in (v for e in estimates for v in e.vehicles):
+        assert np.isfinite([*vehicle.cov, *vehicle.velocity_cov, *vehicle.velocity_mps]).all()

@@ -89,7 +89,7 @@ class PeopleTracker:
     What it knows of the road is the front end's ground in that frame, and its vertical curvature.
     """
 
-    def __init__(self, camera: Camera, config: PeopleTrackingConfig) -> None:
+    def __init__(self, camera: Camera, config: PeopleTrackingConfig, first_id: int = FIRST_PERSON) -> None:
         from scipy.optimize import linear_sum_assignment  # only who tracks holds its 9 MB
 
         self._assign = linear_sum_assignment
@@ -99,7 +99,7 @@ class PeopleTracker:
         self.tracks: list[PersonTrack] = []
         self.frame: OpenFrame | None = None  # the last settled one
         self._pitch_rad: float | None = None
-        self._next_id = FIRST_PERSON
+        self.next_id = first_id
 
     def settle(self, frame: OpenFrame, detections: Detections | None, road: GroundSizeFilter) -> None:
         """The next frame. None for `detections`: no detector looked at it. `road` is the ground in it."""
@@ -214,5 +214,5 @@ class PeopleTracker:
             self.tracks = [self.tracks[row] for row in rows]
         for track, standing in zip(self.tracks, moments.standing[rows].tolist(), strict=True):
             if track.person < 0 and track.hits >= self.config.confirm_hits:
-                track.person, self._next_id = self._next_id, self._next_id + 1
+                track.person, self.next_id = self.next_id, self.next_id + 1
             track.stands = standing > (WALKS if track.stands else STANDS)

@@ -58,6 +58,7 @@ class Tracker:
         ground_size: GroundSizeFilter,
         pseudolidar: PseudoLidarConfig | None = None,
         frustum_network: FrustumNetwork | None = None,
+        first_id: int = 0,
     ) -> None:
         from scipy.optimize import linear_sum_assignment  # only who tracks holds its 9 MB: capture and optimize don't
 
@@ -76,7 +77,7 @@ class Tracker:
             ground_size,
             self.placing.yaw_by_outline,
         )
-        self._next_id = 0
+        self.next_id = first_id
         self._last: EgoFrame | None = None
 
     def localise_vehicles(
@@ -339,5 +340,5 @@ class Tracker:
             if track.vehicle < 0 and track.observation.track_id is not None:
                 track.vehicle = track.observation.track_id
             elif track.vehicle < 0:
-                track.vehicle, self._next_id = self._next_id, self._next_id + 1
+                track.vehicle, self.next_id = self.next_id, self.next_id + 1
         return sorted(seen_now, key=lambda track: track.vehicle)
