@@ -7,6 +7,7 @@ programs and `--constant` vary. An unknown key, a constant or a wrong type is a 
 
 from __future__ import annotations
 
+import difflib
 import hashlib
 import re
 import tomllib
@@ -20,7 +21,7 @@ from birdslam.geometry.camera import Camera
 from birdslam.lanes.amodal.atlas import AtlasConfig
 from birdslam.paper import PAPER
 from birdslam.perception import ModelError, ModelSpec
-from birdslam.runtime.fields import differences, laid_over, leaves, why_no_key
+from birdslam.runtime.fields import differences, fields, laid_over, leaves, why_no_key
 from birdslam.runtime.models import store as model_store
 from birdslam.runtime.schemes import all_schemes, is_live
 from birdslam.runtime.sections import (
@@ -335,7 +336,10 @@ def _explain(message: str) -> tuple[str, str]:
     reason, key = match.groups() if match else (message, "")
     unknown = re.fullmatch(r"Object contains unknown field `(.*)`", reason)
     if unknown:
-        return f"{key}.{unknown[1]}".lstrip("."), "there is no such key"
+        table = f"{key}.".lstrip(".")
+        inside = (field.key.removeprefix(table) for field in fields(Configuration) if field.key.startswith(table))
+        near = difflib.get_close_matches(unknown[1], sorted({rest.partition(".")[0] for rest in inside}), 1)
+        return f"{table}{unknown[1]}", "there is no such key" + "".join(f"; the nearest is {table}{n}" for n in near)
     return key or "configuration", reason
 
 

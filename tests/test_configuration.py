@@ -44,6 +44,8 @@ def test_differences_only(tmp_path: Path) -> None:
     [
         ("[source]\npace = 3\n", "source.pace", "there is no such key"),
         ("[slam.graph]\nlagg = 3\n", "slam.graph.lagg", "there is no such key"),
+        ("[source]\nstrides = 3\n", "source.strides", "; the nearest is source.stride"),
+        ("[sourc]\nstride = 3\n", "sourc", "; the nearest is source"),
         ("colour = 1\n", "colour", "there is no such key"),
         ('[source]\nstride = "two"\n', "source.stride", "Expected `int`, got `str`"),
         ("[source]\nstride = 0\n", "source.stride", ">= 1"),
@@ -51,7 +53,7 @@ def test_differences_only(tmp_path: Path) -> None:
         ('[source]\nrate = "fast"\n', "source.rate", "fast"),
         ('vehicle = "a/b"\n', "vehicle", "matching regex"),
         ("source = 5\n", "source", "Expected `object`"),
-        ('[models.detektor]\npath = "x"\n', "models.detektor", "there is no such key"),
+        ('[models.detektor]\npath = "x"\n', "models.detektor", "there is no such key; the nearest is models.detector"),
         ("[camera]\nwidth_px = 64\n", "camera", "missing required field"),
         (f"[camera]\n{CAMERA.replace('1.5', '15.0')}", "camera", "height_m = 15.0"),
     ],
