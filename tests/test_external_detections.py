@@ -214,20 +214,60 @@ def test_all_three_kinds_of_file_are_read(tmp_path: Path) -> None:
         assert found[0].scores.tolist() == [0.9]
 
 
+@pytest.mark.parametrize("separator", [",", " ", ", "])
+@pytest.mark.parametrize(
+    ("scores", "means"), [((-1, -1), (1.0, 1.0)), ((0.9, 0.2), (0.9, 0.2)), ((2.3, 0.0), (0.909, 0.5))]
+)
+def test_scores_of_mot_text_are_probabilities(
+    tmp_path: Path, separator: str, scores: tuple[float, float], means: tuple[float, float]
+) -> None:
+    """-1 is not stated (MOT's example, norfair); scores beyond 1 are log odds (DPM)."""
+    path = tmp_path / "mot.txt"
+    lines = [separator.join(map(str, (k + 1, -1, 10, 20, 30, 40, score, -1, -1, -1))) for k, score in enumerate(scores)]
+    path.write_text("\n".join(lines))
+    found = read_detection_file(path)
+    assert [found[k].scores[0] for k in (0, 1)] == pytest.approx(means, abs=1e-3)
+    assert found[0].boxes_px.tolist() == [[10.0, 20.0, 40.0, 60.0]]
+
+
+@pytest.mark.parametrize(
+    ("ids", "labels"),
+    [
+        ((3, 1, 8), ("car", "person", "truck")),  # the 2017 set
+        ((2, 0, 7), ("car", "person", "truck")),  # the 80 classes: 0 is none of the 2017 set
+        ((2, 2, 5), ("car", "car", "bus")),  # both sets know these ids: cars are more frequent than bicycles
+        ((3, 3, 2), ("car", "car", "bicycle")),
+        ((2, 12, 7), ("car", "coco 12", "truck")),  # 12 is a gap of the 2017 set
+    ],
+)
+def test_the_id_set_of_coco_is_recognized(tmp_path: Path, ids: tuple[int, ...], labels: tuple[str, ...]) -> None:
+    path = tmp_path / "coco.json"
+    path.write_text(json.dumps([{"image_id": k, "category_id": c, "bbox": [1, 2, 3, 4]} for k, c in enumerate(ids)]))
+    assert tuple(boxes.labels[0] for boxes in read_detection_file(path).values()) == labels
+
+
+@given(st.lists(st.tuples(*[st.floats(-2000.0, 2000.0)] * 2, *[st.floats(1.0, 500.0)] * 2), min_size=1))
+def test_boxes_inside_lie_in_the_image(corners: list[tuple[float, float, float, float]]) -> None:
+    box = np.array([(x, y, x + w, y + h) for x, y, w, h in corners])
+    found = Detections(box, np.full(len(box), 0.5), ("car",) * len(box)).inside(640, 480)
+    assert (found.boxes_px >= 0.0).all()
+    assert (found.boxes_px <= [640, 480, 640, 480]).all()
+    assert len(found) == sum(x < 640 and y < 480 and x + w > 0 and y + h > 0 for x, y, w, h in corners)
+
+
 @pytest.mark.parametrize(
     ("text", "says"),
     [
         ("1,5,10,20,30,40,0.9\n1,5,10,20,thirty,40,0.9\n", "line 2"),
         ("1,5,10,20,30,40,0.9\n2,5,10,20\n", "line 2: has 4 columns"),
         ("0,5,10,20,30,40,0.9\n", "frames begin at 1"),
-        ("1,5,10,20,30,40,1.9\n", "line 1: score 1.9"),
         ("1,5,10,20,-30,40,0.9\n", "line 1: its width"),
         ("1,5,10,20,nan,40,0.9\n", "line 1: needs finite"),
         ("1.5,5,10,20,30,40,0.9\n", "line 1: '1.5' is no whole number"),
         ("1,5,10,20,30,40,0.9\n1,5,50,20,30,40,0.9\n", "line 1 to line 2: track_ids"),
         ("0 5 Car 0 0 -10 10 20 40\n", "line 1: has 9 columns"),
         ("0 5 Car 0 0 0 1 2 3 4\n0 6 car 0 0 0 5 2 9 4\n", "line 2: type car is none of Car, Van"),
-        ('[{"image_id": 0, "category_id": 0, "bbox": [1, 2, 3, 4], "score": 1}]', "category_id 0 is not in 1 to 90"),
+        ('[{"image_id": 0, "category_id": 95, "bbox": [1, 2, 3, 4], "score": 1}]', "neither COCO's 1 to 90"),
         ("", "holds no boxes"),
         ("[{]", "is no JSON"),
         ('{"images": []}', "are a list"),
@@ -254,6 +294,8 @@ def test_a_file_of_another_drive_is_refused(tmp_path: Path, seen: Seen) -> None:
     path.write_text("1,-1,9000,20,30,40,0.9\n")
     with pytest.raises(DatasetError, match="outside of the image"):
         check_detections(seen.recording, path)
+    path.write_text("1,-1,9000,20,30,40,0.9\n1,-1,-10,20,30,40,0.9\n")
+    assert check_detections(seen.recording, path).endswith("2 boxes, 2 of car; 1 outside of the image are dropped")
     with pytest.raises(ConfigurationError, match="no loop"):
         open_source(load(None, {"source.uri": "demo", "source.loop": True, "source.detections": str(path)}))
     assert Configuration().source.detections == ""

@@ -195,6 +195,8 @@ class Networks:
         self._last_frame = frame_id
         if detections is None and self._detections is not None:
             detections = self._detections.get(frame_id, NO_DETECTIONS)
+            if image is not None:
+                detections = detections.inside(image.shape[1], image.shape[0])
         if detections is not None:
             only = BESIDE_BOXES if only is None else tuple(role for role in only if role in BESIDE_BOXES)
         started_any = False

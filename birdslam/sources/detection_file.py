@@ -1,9 +1,11 @@
 """Boxes of another detector or tracker over a recording, as a file, in px of the undistorted images.
 
-MOT challenge text: `frame,id,left,top,width,height,score,...`, frames from 1, id -1: not tracked; all are cars.
+MOT challenge text: `frame,id,left,top,width,height,score,...`, by commas or blanks, frames from 1, id -1: not tracked,
+score -1: not stated, scores beyond 1 are log odds; all are cars.
 KITTI tracking text: `frame id type truncated occluded alpha x1 y1 x2 y2 ...`, frames from 0, the score the 18th column.
 COCO results: a JSON list of {"image_id", "category_id", "bbox": [left, top, width, height], "score"}, with "track_id"
-where something was tracked; `image_id` is the frame, from 0, `category_id` that of COCO's 2017 set.
+where something was tracked; `image_id` is the frame, from 0, `category_id` that of the 2017 set (1 to 90), or of the 80
+classes without gaps (from 0). The set is the one that knows all ids; if both do, the one with more cars.
 Errors are DatasetError and name the file and the first line that is wrong.
 """
 
@@ -11,6 +13,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,9 +26,12 @@ from birdslam.sources.recording import DatasetError, Recording
 # COCO's category ids of who is on a road; others are boxes without a meaning here
 COCO = {1: "person", 2: "bicycle", 3: "car", 4: "motorcycle", 6: "bus", 8: "truck"}
 COCO_LAST = 90
+COCO_GAPS = frozenset({12, 26, 29, 30, 45, 66, 68, 69, 71, 83})  # ids that the 2017 set does not use
+COCO_80 = {0: "person", 1: "bicycle", 2: "car", 3: "motorcycle", 5: "bus", 7: "truck"}
 # KITTI's types: who is on a road, and what else its text may name, which has no meaning here
 KITTI = {"Car": "car", "Van": "van", "Truck": "truck", "Pedestrian": "person", "Person": "person", "Cyclist": "cyclist"}
 KITTI_OTHERS = ("Person_sitting", "Tram", "Misc", "DontCare")
+NOT_STATED = -1.0  # a score in MOT's text
 _MAX_BYTES = 1 << 30
 _MOT_COLUMNS, _KITTI_COLUMNS, _KITTI_SCORE = 7, 10, 17
 
@@ -50,15 +56,22 @@ def read_detection_file(path: Path, detector: Family | EdgeSigma = "unknown") ->
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(f"{path}: can't be read: {getattr(error, 'strerror', None) or 'not UTF-8'}") from None
     frames: dict[int, list[tuple[str, _Box]]] = {}
-    for where, box in _coco(path, text) if text.lstrip()[:1] in ("[", "{") else _lines(path, text):
+    is_json = text.lstrip()[:1] in ("[", "{")
+    for where, box in _coco(path, text) if is_json else _probable(path, list(_lines(path, text))):
         frames.setdefault(box.frame, []).append((where, box))
     if not frames:
-        raise DatasetError(f"{path}: holds no boxes")
+        raise DatasetError(
+            f"{path}: holds no boxes; expected MOT or KITTI tracking text or COCO results. For YOLO text, COCO data "
+            "sets or supervision's CSV use `BirdSLAM.step(frame, detections)`"
+        )
     return {frame: _of_frame(path, boxes, detector) for frame, boxes in frames.items()}
 
 
-def check_detections(recording: Recording, path: Path, stride: int = 1) -> None:
-    """Raises DatasetError where the file can't be of this recording: boxes after its end or outside its images."""
+def check_detections(recording: Recording, path: Path, stride: int = 1) -> str:
+    """Returns what is remarkable about the boxes, or "".
+
+    Raises DatasetError where the file can't be of this recording: boxes after its end, or all outside its images.
+    """
     found = read_detection_file(path)
     if stride != 1:
         raise DatasetError(f"{path}: has the boxes of each frame, and every {stride}th is driven")
@@ -66,12 +79,13 @@ def check_detections(recording: Recording, path: Path, stride: int = 1) -> None:
     if last >= len(recording):
         raise DatasetError(f"{path}: has boxes of frame {last}, {recording.name} ends at {len(recording) - 1}")
     width_px, height_px = recording.camera.width_px, recording.camera.height_px
-    for frame, boxes in found.items():
-        corners = boxes.boxes_px
-        outside = (corners[:, :2] >= (width_px, height_px)).any(axis=1) | (corners[:, 2:] <= 0.0).any(axis=1)
-        if outside.any():
-            box = corners[outside.argmax()].tolist()
-            raise DatasetError(f"{path}: frame {frame} has {box} outside of the image of {width_px}x{height_px} px")
+    total = sum(len(boxes) for boxes in found.values())
+    dropped = total - sum(len(boxes.inside(width_px, height_px)) for boxes in found.values())
+    if dropped == total:
+        raise DatasetError(f"{path}: all boxes are outside of the image of {width_px}x{height_px} px")
+    labels = Counter(label for boxes in found.values() for label in boxes.labels)
+    words = f"{path}: {total} boxes, " + ", ".join(f"{count} of {label}" for label, count in labels.most_common(6))
+    return words + (f"; {dropped} outside of the image are dropped" if dropped else "")
 
 
 def _of_frame(path: Path, boxes: list[tuple[str, _Box]], detector: Family | EdgeSigma) -> Detections:
@@ -94,9 +108,20 @@ def _lines(path: Path, text: str) -> Iterator[tuple[str, _Box]]:
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         try:
-            yield f"line {number}", _mot(line.split(",")) if "," in line else _kitti(line.split())
+            words = line.replace(",", " ").split()
+            is_kitti = len(words) > 2 and words[2][:1].isalpha() and "," not in line
+            yield f"line {number}", _kitti(words) if is_kitti else _mot(words)
         except ValueError as error:
             raise DatasetError(f"{path}: line {number}: {error or 'is no box'}: {line.strip()[:60]!r}") from None
+
+
+def _probable(path: Path, found: list[tuple[str, _Box]]) -> Iterator[tuple[str, _Box]]:
+    """Scores as probabilities: -1 is 1, and where any other is not in [0, 1] all are log odds."""
+    stated = [box.score for _, box in found if box.score != NOT_STATED]
+    log_odds = any(not 0.0 <= score <= 1.0 for score in stated)
+    for where, box in found:
+        score = 1.0 if box.score == NOT_STATED else box.score
+        yield where, box._replace(score=1.0 / (1.0 + math.exp(-max(score, -700.0))) if log_odds else score)
 
 
 def _mot(words: list[str]) -> _Box:
@@ -127,22 +152,34 @@ def _coco(path: Path, text: str) -> Iterator[tuple[str, _Box]]:
         raise DatasetError(f"{path}: is no JSON: {error}") from None
     if not isinstance(entries, list):
         raise DatasetError(f"{path}: COCO's results are a list of boxes")
+    labels = _coco_labels(path, entries)
     for number, entry in enumerate(entries):
         try:
-            yield f"entry {number}", _coco_box(entry)
+            yield f"entry {number}", _coco_box(entry, labels)
         except (KeyError, TypeError, ValueError) as error:
             raise DatasetError(f"{path}: entry {number} is no box of COCO's results: {error}") from None
 
 
-def _coco_box(entry: dict[str, Any]) -> _Box:
+def _coco_labels(path: Path, entries: list[Any]) -> dict[int, str]:
+    """The class names of the ids: of the set that knows all of them; if both do, of the one with more cars."""
+    ids = Counter(entry.get("category_id") for entry in entries if isinstance(entry, dict))
+    numbers = {number for number in ids if isinstance(number, int)}
+    of_2017 = all(1 <= number <= COCO_LAST for number in numbers) and COCO_GAPS.isdisjoint(numbers)
+    of_80 = all(0 <= number < 80 for number in numbers)
+    if not of_2017 and not of_80:
+        raise DatasetError(f"{path}: category_id: {sorted(numbers)[:5]} ... are neither COCO's 1 to 90 nor its 0 to 79")
+    return COCO if of_2017 and (not of_80 or ids[3] >= ids[2]) else COCO_80
+
+
+def _coco_box(entry: dict[str, Any], labels: dict[int, str]) -> _Box:
     left, top, width, height = (float(number) for number in entry["bbox"])
     category = _whole(entry["category_id"])
-    if not 1 <= category <= COCO_LAST:
-        raise ValueError(f"category_id {category} is not in 1 to {COCO_LAST}")
     box_px = left, top, left + width, top + height
     track = _whole(entry.get("track_id", -1))
-    label = COCO.get(category, f"coco {category}")
-    return _checked(_Box(_whole(entry["image_id"]), max(track, -1), label, box_px, float(entry.get("score", 1.0))))
+    label, score = labels.get(category, f"coco {category}"), float(entry.get("score", 1.0))
+    if not 0.0 <= score <= 1.0:
+        raise ValueError(f"score {score:g} is not in [0, 1]")
+    return _checked(_Box(_whole(entry["image_id"]), max(track, -1), label, box_px, score))
 
 
 def _checked(box: _Box) -> _Box:
@@ -150,8 +187,6 @@ def _checked(box: _Box) -> _Box:
         raise ValueError(f"frame {box.frame} is none")
     if not all(map(math.isfinite, (*box.box_px, box.score))):
         raise ValueError("needs finite numbers")
-    if not 0.0 <= box.score <= 1.0:
-        raise ValueError(f"score {box.score:g} is not in [0, 1]")
     x1, y1, x2, y2 = box.box_px
     if x2 < x1 or y2 < y1:
         raise ValueError("its width or height is negative")

@@ -41,8 +41,8 @@ class Given:
 def lens_of(given: Given, uri: str, topics: BagTopics) -> tuple[Intrinsics | None, float | None]:
     """Intrinsics from elsewhere than the recording, and the height that the user states."""
     height_m = given.height_m
-    if height_m is not None and not 0.2 < height_m < 5.0:
-        raise ConfigurationError(f"--height {height_m:g}: is no height of a camera over the road (0.2 to 5 m)")
+    if height_m is not None and not 0.2 <= height_m <= 5.0:
+        raise ConfigurationError(f"--height {height_m:g}: a camera is 0.2 to 5 m above the road")
     if given.camera is not None:
         old = load_camera(given.camera)
         numbers = {name: getattr(old, name) for name in ("fx_px", "fy_px", "cx_px", "cy_px", "distortion", "fisheye")}

@@ -119,11 +119,14 @@ def _open_camera(scheme: Scheme, configuration: Configuration, must_open: bool) 
 
 def _check_beside(recording: Recording, source: SourceConfig) -> None:
     """Raises ConfigurationError or DatasetError where odometry or boxes of a file can't be of this recording."""
-    for file, check in ((source.odometry, check_odometry), (source.detections, check_detections)):
-        if file and source.loop:
-            raise ConfigurationError(f"{file}: is of one way through the recording: no loop")
-        if file:
-            check(recording, of_sequence(Path(file).expanduser(), recording.name), source.stride)
+    for file in filter(None, (source.odometry, source.detections)):
+        if source.loop:
+            raise ConfigurationError(f"{file}: is of one pass through the recording; leave source.loop out (no loop)")
+    if source.odometry:
+        check_odometry(recording, of_sequence(Path(source.odometry).expanduser(), recording.name), source.stride)
+    if source.detections:
+        path = of_sequence(Path(source.detections).expanduser(), recording.name)
+        log.warning("%s", check_detections(recording, path, source.stride))
 
 
 class RecordedSource:

@@ -49,7 +49,19 @@ class Detections:
 
     def only(self, labels: Collection[str]) -> Detections:
         """Those with one of the labels."""
-        keep = [i for i, label in enumerate(self.labels) if label in labels]
+        return self.take([i for i, label in enumerate(self.labels) if label in labels])
+
+    def inside(self, width_px: int, height_px: int) -> Detections:
+        """Clips boxes to the image and drops those that lie outside it."""
+        box, size = self.boxes_px, np.array([width_px, height_px], np.float64)
+        if not len(box) or ((box >= 0.0).all() and (box[:, 2:] <= size).all()):
+            return self
+        seen = (box[:, :2] < size).all(axis=1) & (box[:, 2:] > 0.0).all(axis=1)
+        kept = self.take(np.flatnonzero(seen).tolist())
+        return replace(kept, boxes_px=np.clip(kept.boxes_px, 0.0, np.tile(size, 2)))
+
+    def take(self, keep: Sequence[int]) -> Detections:
+        """Those with these indices."""
         bodies = None if self.boxes3d is None else self.boxes3d.take(keep)
         labels_kept = tuple(self.labels[i] for i in keep)
         ids = None if self.track_ids is None else self.track_ids[keep]
