@@ -19,7 +19,7 @@ from birdslam.perf.errors import PerfError
 from birdslam.types import Estimate, VehicleEstimate
 
 label = "a listener of ROS 2: messages lost, and their age"
-PEER = "birdslam.perf.ros2.ros_peer"
+PEER = "tests.ros_peer"
 VEHICLE = "ros-perf"
 HEARD = {
     "/birdslam/odometry": "nav_msgs/msg/Odometry",
