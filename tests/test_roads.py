@@ -64,10 +64,10 @@ def test_cold_starts_on_roads_have_the_right_scale() -> None:
 
 
 def test_cold_starts_behind_a_windscreen_have_the_right_scale() -> None:
-    """Of 24 starts: median error 0.9 %, 89 % valid, no motion of 552 wrong while valid."""
-    drives = [(name, effect) for name in ("motorway_20", "motorway_40") for effect in ON_THE_GLASS]
+    """Of 16 starts: median error 0.8 %, 90 % valid, no motion of 372 wrong while valid."""
+    drives = [("motorway_40", effect) for effect in ON_THE_GLASS]
     check_starts(
-        [measure(read(DemoRecording(directory=CLIPS / n), EFFECTS[effect]()), (0, 2, 4)) for n, effect in drives], 0.01
+        [measure(read(DemoRecording(directory=CLIPS / n), EFFECTS[e]()), (0, 1, 2, 4)) for n, e in drives], 0.01
     )
 
 

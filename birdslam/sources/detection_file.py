@@ -1,12 +1,9 @@
 """Boxes of another detector or tracker over a recording, as a file, in px of the undistorted images.
 
-MOT challenge text: `frame,id,left,top,width,height,score,...`, by commas or blanks, frames from 1, id -1: not tracked,
-score -1: not stated, scores beyond 1 are log odds; all are cars.
+MOT challenge text: `frame,id,left,top,width,height,score,...`, frames from 1, score -1: not stated; all are cars.
 KITTI tracking text: `frame id type truncated occluded alpha x1 y1 x2 y2 ...`, frames from 0, the score the 18th column.
-COCO results: a JSON list of {"image_id", "category_id", "bbox": [left, top, width, height], "score"}, with "track_id"
-where something was tracked; `image_id` is the frame, from 0, `category_id` that of the 2017 set (1 to 90), or of the 80
-classes without gaps (from 0). The set is the one that knows all ids; if both do, the one with more cars.
-Errors are DatasetError and name the file and the first line that is wrong.
+COCO results: a JSON list of {"image_id", "category_id", "bbox": [left, top, width, height], "score", "track_id"},
+frames from 0. Errors are DatasetError and name the file and the first wrong line.
 """
 
 from __future__ import annotations
