@@ -17,7 +17,7 @@ CORES := $(or $(shell nproc 2>/dev/null),2)
 unexport PYTHONDONTWRITEBYTECODE
 ON_EACH_CHANGE := not slow and not faults and not onroad
 
-.PHONY: setup lock newest browser test test-cpus test-cpus-sample test-slow pythons wheel-test index-test fuzz faults onroad perf lint types train demo demo-kitti clean
+.PHONY: picture setup lock newest browser test test-cpus test-cpus-sample test-slow pythons wheel-test index-test fuzz faults onroad perf lint types train demo demo-kitti clean
 
 setup: $(VENV)/.ready
 
@@ -140,6 +140,11 @@ types: setup
 # The drive that ships with birdslam: the three processes at its 33 Hz, then how good it was, bev.png and drive.mp4
 demo: setup
 	$(BIN)/birdslam run --source demo --output out/demo
+
+# The moving picture of the README
+picture: setup
+	$(BIN)/birdslam run --source demo --rate max --set source.frames=420 --output out/picture --video out/picture/drive.mp4
+	$(BIN)/python docs/animation.py out/picture/drive.mp4 docs/drive.webp 40 210
 
 # The main job on a real sequence
 demo-kitti: setup
