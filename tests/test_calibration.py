@@ -483,3 +483,23 @@ def test_a_films_sigma_has_the_time_of_its_rows_in_it() -> None:
     speed = HeightCheck(cue="speed", height_m=1.3, sigma_m=0.03, samples=9)  # has it in
     by_speed = msgspec.structs.replace(found, height_checks=(speed,))
     assert with_height(by_speed, False, None, "video:f.mp4", readout=USUAL)[0].scale_sigma_rel < 0.03
+
+
+def test_a_fisheye_calibration_of_opencvs_sample_is_equidistant(tmp_path: Path) -> None:
+    path = tmp_path / "fisheye.yml"
+    text = (
+        "%YAML:1.0\n---\nimage_width: 1280\nimage_height: 720\nflags: 270\nfisheye_model: 1\n"
+        "camera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n"
+        "   data: [ 640., 0., 639.5, 0., 640., 359.5, 0., 0., 1. ]\n"
+        "distortion_coefficients: !!opencv-matrix\n   rows: 4\n   cols: 1\n   dt: d\n"
+        "   data: [ -0.02, 0.005, -0.004, 0.001 ]\n"
+    )
+    path.write_text(text)
+    found = read_intrinsics(path)
+    assert found.fisheye
+    assert found.distortion == (-0.02, 0.005, -0.004, 0.001)
+    path.write_text(text.replace("rows: 4", "rows: 5").replace("0.001 ]", "0.001, 0.1 ]"))
+    with pytest.raises(DatasetError, match="4 coefficients, not 5"):
+        read_intrinsics(path)
+    path.write_text(text.replace("fisheye_model: 1", "fisheye_model: 0"))
+    assert not read_intrinsics(path).fisheye

@@ -25,7 +25,7 @@ from birdslam.runtime.configuration import load
 from birdslam.runtime.nodes.sources import open_source
 from birdslam.sources.opening import open_recording
 from birdslam.sources.recording import DatasetError, Recording
-from birdslam.sources.rosbag import RosbagRecording
+from birdslam.sources.rosbag import MAX_CLOCK_ERROR_NS, ImageClock, RosbagRecording
 from birdslam.sources.rosbag_truth import east_north_up
 from birdslam.trajectory import as_poses, mount_pose
 from birdslam.types import Estimate
@@ -408,3 +408,23 @@ def test_a_run_opens_it_with_its_topics(tmp_path: Path) -> None:
     config = tmp_path / "run.toml"
     config.write_text('[source]\nuri = "rosbag:drive"\n[source.topics]\nimage = "/car/front/image_raw"\n')
     assert open_source(load(config)).name == "drive"
+
+
+@given(
+    st.lists(st.integers(20_000_000, 200_000_000), min_size=2, max_size=30),
+    st.dictionaries(st.integers(1, 29), st.integers(-(10**18), 10**18), max_size=4),
+)
+def test_images_go_on_across_steps_of_their_clock(periods_ns: list[int], steps_ns: dict[int, int]) -> None:
+    """Whatever the clock of the stamps does, the images keep their periods; small errors of both clocks stay."""
+    clock, stamp_ns, recorded_ns, times = ImageClock(), 0, 10**18, []
+    for k, period_ns in enumerate(periods_ns):
+        step_ns = steps_ns.get(k, 0)
+        stamp_ns += period_ns + (step_ns if abs(step_ns) > 2 * MAX_CLOCK_ERROR_NS else 0)
+        recorded_ns += period_ns
+        times.append(clock.time_ns(stamp_ns, recorded_ns))
+    assert np.diff(times).tolist() == periods_ns[1:]
+
+
+def test_a_pause_of_a_bag_stays() -> None:
+    clock = ImageClock()
+    assert [clock.time_ns(t, t + 7) for t in (0, 10**8, 300 * 10**9, 300 * 10**9 + 10**8)][2] == 300 * 10**9

@@ -120,7 +120,10 @@ def _read_yaml(path: Path) -> Intrinsics:
     model = str(tree.get("distortion_model") or "")
     if model not in DISTORTIONS and any(distortion):
         raise DatasetError(f"{path}: distortion_model {model} is not supported (only {', '.join(DISTORTIONS[:4])})")
-    fisheye = model == "equidistant"  # which bends the image with zeros too
+    # OpenCV's calibration sample writes `fisheye_model: 1`; an equidistant lens bends the image with zeros too
+    fisheye = model == "equidistant" or bool(tree.get("fisheye_model"))
+    if fisheye and len(distortion) > 4:
+        raise DatasetError(f"{path}: a fisheye model has 4 coefficients, not {len(distortion)}")
     return Intrinsics(
         fx_px=K[0],
         fy_px=K[4],

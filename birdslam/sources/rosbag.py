@@ -27,6 +27,7 @@ from birdslam.sources.speed_file import SIGMA_MPS, YAW_RATE_SIGMA_RADPS
 from birdslam.sources.speed_log import SpeedLog
 from birdslam.types import NS_PER_S, SpeedReading
 
+MAX_CLOCK_ERROR_NS = NS_PER_S  # between the steps of two clocks: beyond it one of them was set
 RATED_IMAGES = 30  # the first ones: the median of their intervals gives the frame rate
 
 
@@ -133,11 +134,11 @@ class RosbagRecording(Recording):
 
     def frames(self, start: int = 0) -> Iterator[RecordedFrame]:
         """Every frame in order, decoded when asked for."""
-        last_ns, position = None, -1
+        last_ns, position, clock = None, -1, ImageClock()
         try:
             with Bag(self._path) as bag:
                 for position, message in enumerate(bag.messages(self._topic)):
-                    t_ns = self._time_ns(message)
+                    t_ns = clock.time_ns(self._time_ns(message), message.t_ns)
                     late = last_ns is not None and t_ns <= last_ns
                     last_ns = last_ns + 1 if late and last_ns is not None else t_ns
                     index, between = divmod(position, self._stride)
@@ -181,6 +182,27 @@ class RosbagRecording(Recording):
                 return truth_rows(times, truth, StaticFrames(bag), frame, self.camera.ground)
         except ValueError as error:
             raise DatasetError(f"{self._path}: {self._topics.truth}: {error}") from None
+
+
+class ImageClock:
+    """Time of images across steps of their clock: uptime before NTP, a clock that is set, a first stamp of zero.
+
+    Where the stamps and the times of recording advance by amounts that differ by more than a second, the stamps' clock
+    was set: they go on by the time of recording. A pause, by which both advance, stays.
+    """
+
+    def __init__(self) -> None:
+        self._shift_ns = 0
+        self._last: tuple[int, int] | None = None  # stamp and time of recording
+
+    def time_ns(self, stamp_ns: int, recorded_ns: int) -> int:
+        """The time of the next image in the clock of the first."""
+        if self._last is not None:
+            by_stamps, by_recording = stamp_ns - self._last[0], recorded_ns - self._last[1]
+            if abs(by_stamps - by_recording) > MAX_CLOCK_ERROR_NS and by_recording >= 0:
+                self._shift_ns += by_recording - by_stamps
+        self._last = stamp_ns, recorded_ns
+        return stamp_ns + self._shift_ns
 
 
 def _image_topic(bag: Bag, topics: BagTopics) -> str:
