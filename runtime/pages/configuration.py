@@ -1,4 +1,4 @@
-"""The page of all keys (docs/configuration.md), from their questions and the typed fields: `birdslam configuration`."""
+"""The page of all keys (docs/configuration.md), from their meanings and the typed fields: `birdslam configuration`."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Key:
     """One row: a key of the configuration."""
 
     key: str
-    question: str
+    meaning: str
     unit: str
     default: str
     may_be: str
@@ -62,16 +62,16 @@ def page() -> str:
 def rows(group: Group) -> Iterator[Key]:
     """Those of a group's keys."""
     known = list(fields(Configuration, Configuration()))
-    for key, question in group.questions.items():
+    for key, meaning in group.meanings.items():
         alike = [field for field in known if field.key == key or (field.key not in KEYS and stands_for(key, field.key))]
         field = alike[0]
-        yield Key(key, question, unit(f"_{field.name}"), _default(alike), _may_be(field.kind))
+        yield Key(key, meaning, unit(f"_{field.name}"), _default(alike), _may_be(field.kind))
 
 
 def _markdown(group: Group) -> str:
-    cells = [(f"`{row.key}`", row.question, row.unit, row.default, row.may_be) for row in rows(group)]
+    cells = [(f"`{row.key}`", row.meaning, row.unit, row.default, row.may_be) for row in rows(group)]
     head = f"## {group.title}\n\n" + (f"{group.about}\n\n" if group.about else "")
-    return head + table([("key", "question", "unit", "default", "may be"), *cells])
+    return head + table([("key", "meaning", "unit", "default", "may be"), *cells])
 
 
 def _default(alike: list[Field]) -> str:
