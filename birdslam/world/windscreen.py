@@ -130,33 +130,3 @@ def bonnet(image: Image) -> Image:
     shown = LACQUER_GREY + MIRRORED * np.roll(upside_down, round(0.5 * height), axis=0)
     cover = mask if image.ndim == 2 else mask[..., None]
     return np.clip((1.0 - cover) * image + cover * shown, 0.0, 255.0).astype(np.uint8)
-
-
-def caption(index: int, count: int, image: Image) -> Image:
-    """Place and time along the lower edge, as dashboard cameras write them."""
-    out = image.copy()
-    rows, columns = out.shape[:2]
-    text = f"CAM 2 2020-01-01 12:{index // 1800:02d}:{index // 30 % 60:02d} N51.0000 W114.0000 40 KM/H"
-    at = round(0.01 * columns), round(0.985 * rows)
-    cv2.putText(out, text, at, cv2.FONT_HERSHEY_PLAIN, columns / 900.0, (235,) * 3, max(1, columns // 700))
-    return out
-
-
-def wiper(images: int) -> Edit:
-    """A dark, blurred blade that sweeps to one side and back again within so many images, then rests for as many."""
-
-    def edit(index: int, count: int, image: Image) -> Image:
-        share = (index % (2 * images)) / images
-        if share >= 1.0:
-            return image
-        height, width = image.shape[:2]
-        angle = np.pi * (0.05 + 0.9 * (1.0 - abs(2.0 * share - 1.0)))
-        pivot = round(0.5 * width), round(1.15 * height)
-        tip = pivot[0] + round(0.75 * width * np.cos(angle)), pivot[1] - round(0.75 * width * np.sin(angle))
-        cover = np.zeros((height, width), np.float32)
-        cv2.line(cover, pivot, tip, 1.0, max(3, round(0.03 * width)), cv2.LINE_AA)
-        soft = cv2.GaussianBlur(cover, (0, 0), 0.006 * width)
-        hidden = soft if image.ndim == 2 else soft[..., None]
-        return np.clip((1.0 - hidden) * image + hidden * 12.0, 0.0, 255.0).astype(np.uint8)
-
-    return edit

@@ -1,1 +1,1 @@
-"""ONNX files: reading, speeding up, and conversion from OpenVINO's format."""
+"""ONNX files: outputs that nobody reads and weights that slow a processor down are taken out."""

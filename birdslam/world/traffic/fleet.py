@@ -195,13 +195,6 @@ def draw_pedestrian(rng: np.random.Generator) -> Body:
     return Body("pedestrian", m.PEDESTRIAN, P)
 
 
-def give_pram(body: Body) -> Body:
-    """A grown-up, who pushes a pram from now on: it is seen with them, and no part of their footprint."""
-    body.parameters[m.HEIGHT] = max(body.parameters[m.HEIGHT], 1.55)
-    body.parameters[m.GLOSS] = 1.0
-    return body
-
-
 def draw_cyclist(rng: np.random.Generator) -> Body:
     """Someone on a bicycle or a scooter."""
     P = np.zeros(m.SLOTS, np.float32)
