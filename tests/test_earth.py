@@ -194,3 +194,24 @@ def test_the_dashcams_own_fixes_are_read(data_dir: Path) -> None:
     fixes = read_fixes(path.read_bytes(), str(path), 0)
     assert len(fixes) == 20
     assert all(7.0 < fix.speed_mps < 13.0 for fix in fixes if fix.speed_mps)
+
+
+@given(
+    st.dictionaries(st.integers(0, 39), st.tuples(st.floats(-1e5, 1e5), st.floats(-1e5, 1e5)), max_size=4),
+    st.integers(0, 5),
+)
+def test_a_few_fixes_anywhere_do_not_move_the_drive(wrong: dict[int, tuple[float, float]], seed: int) -> None:
+    """Of 40 fixes up to four are off by up to 100 km, the first ones too."""
+    t_ns, poses, enu = a_drive()
+    moved = enu.copy()
+    for k, offset in wrong.items():
+        moved[10 * k] += offset
+    earth = place_on_earth(t_ns, poses, fixes_of(t_ns, moved, 1.0, seed))
+    assert worst_m(earth, poses, enu) < 5.0
+    assert earth.outliers <= len(wrong) + 1
+
+
+def test_a_fix_at_zero_zero_is_no_fix() -> None:
+    rows = "time_s,latitude_deg,longitude_deg\n" + "\n".join(f"{k},{51.0 + 1e-5 * k},7.0" for k in range(5))
+    found = read_fixes(f"{rows}\n5,0.0,0.0\n6,51.0,7.0\n".encode(), "fixes.csv", 0)
+    assert len(found) == 6

@@ -24,6 +24,8 @@ GATE = 3.0  # standard deviations
 DELAYS_S = np.arange(-2.0, 2.01, 0.1)
 DELAY_SIGMA_S = 0.5
 WINDOW_S, MAX_WINDOWS = 60.0, 10  # in which fixes are compared with odometry for their delay
+START_FIXES = 60  # whose pairs are tried for a start
+START_REL = 0.1  # drift of odometry over the distance from the centre, up to which a fix agrees with a start
 ITERATIONS, WINDOW_ITERATIONS = 30, 16
 SCALE_SIGMA = 0.1  # of the scale's logarithm, by the camera's file
 SPEED_SIGMA = 0.01  # of all speeds of a drive together, which receivers smooth
@@ -156,8 +158,8 @@ def place_on_earth(t_ns: Ints, poses: list[SE2], fixes: list[GnssFix]) -> Earth:
     xy = np.array([(pose.x_m, pose.y_m) for pose in poses])
     seconds = (t_ns - t_ns[0]) / NS_PER_S
     times = np.array([(fix.t_source_ns - int(t_ns[0])) / NS_PER_S for fix in fixes])
-    origin = fixes[0].latitude_deg, fixes[0].longitude_deg
     degrees = np.array([(fix.latitude_deg, fix.longitude_deg) for fix in fixes])
+    origin = _central(degrees)
     east, north, _ = pymap3d.geodetic2enu(degrees[:, 0], degrees[:, 1], 0.0, *origin, 0.0)
     enu, sigma = np.column_stack([east, north]), np.array([max(fix.sigma_m, 0.01) for fix in fixes])
     delay_s, delay_sigma_s = _delay(seconds, xy, times, enu, sigma)
@@ -233,14 +235,13 @@ def fit(
     """(east, north, yaw, log scale), their covariance, and each fix's chi-square; Gauss-Newton with Cauchy weights.
 
     `log_scale`: what is known of it beforehand, with its 1-sigma.
-    The start is a line through a robust pair of distant medians: Umeyama's closed form (1991) on all.
+    The start is the pair of fixes that most others agree with (RANSAC over all pairs of evenly spaced fixes).
     """
-    centre, there = np.median(xy, axis=0), np.median(enu, axis=0)
-    a, b = xy - centre, enu - there
-    turned = complex((a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1]).sum(), (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum())
+    centre = np.median(xy, axis=0)
+    a = xy - centre
     known, by = log_scale[0], log_scale[1] ** -2
-    yaw, log_scale_now = math.atan2(turned.imag, turned.real), known
-    shift = there.copy()
+    yaw, shift = _start(a, enu, sigma, math.exp(known))
+    log_scale_now = known
     H: Floats = np.eye(4)
     chi2: Floats = np.zeros(len(xy))
     for iteration in range(iterations):
@@ -264,6 +265,28 @@ def fit(
     moved = shift - scale * (centre @ np.array([[c, s], [-s, c]]))
     cov: Floats = np.linalg.inv(H + 1e-9 * np.eye(4)).astype(np.float64)
     return np.array([*moved, yaw, log_scale_now]), cov, chi2
+
+
+def _start(a: Floats, enu: Floats, sigma: Floats, scale: float) -> tuple[float, Floats]:
+    """Yaw and shift (2,) of `enu` over `a` (N, 2) by the pair of points with the least sum of truncated errors."""
+    p, q = scale * (a[:, 0] + 1j * a[:, 1]), enu[:, 0] + 1j * enu[:, 1]
+    some = np.unique(np.linspace(0, len(p) - 1, START_FIXES).astype(int))
+    i, j = (some[k] for k in np.triu_indices(len(some), 1))
+    far = np.abs(p[j] - p[i]) >= 0.25 * np.abs(p - p.mean()).max()
+    i, j = i[far], j[far]
+    if not len(i):
+        return 0.0, np.median(enu, axis=0)
+    turn = np.exp(1j * np.angle((q[j] - q[i]) / np.where(p[j] == p[i], 1.0, p[j] - p[i])))
+    shift = 0.5 * (q[i] + q[j] - turn * (p[i] + p[j]))
+    error = np.abs(q - turn[:, None] * p - shift[:, None]) / np.maximum(3.0 * sigma, START_REL * np.abs(p))
+    best = int(np.minimum(error, 1.0).sum(axis=1).argmin())
+    return float(np.angle(turn[best])), np.array([shift[best].real, shift[best].imag])
+
+
+def _central(degrees: Floats) -> tuple[float, float]:
+    """The fix (latitude, longitude) that is nearest to the median of all: a single one may be anywhere."""
+    nearest = int(np.abs(degrees - np.median(degrees, axis=0)).sum(axis=1).argmin())
+    return float(degrees[nearest, 0]), float(degrees[nearest, 1])
 
 
 def _speed_ratios(seconds: Floats, xy: Floats, at: Floats, fixes: list[GnssFix]) -> list[float]:

@@ -42,6 +42,7 @@ def read_fixes(data: bytes, name: str, begin_ns: int) -> list[GnssFix]:
         fixes, utc = _nmea(text, name), True
     else:
         fixes, utc = _csv(text, name), False
+    fixes = [fix for fix in fixes if fix[1] or fix[2]]  # receivers without a fix write 0, 0
     if not fixes:
         raise GnssError(f"{name}: has no fix")
     if len(fixes) > MAX_FIXES:
