@@ -64,7 +64,7 @@ def test_films_run_beside_each_other_and_beside_a_live_car(place: Path, films: i
                 assert sentence in out
                 assert sentence in (place / name / "README.txt").read_text()
             assert "of its budget" not in out  # nobody waited for its frames
-        lengths = [line for line in summary["verdict"] if line.startswith("Next: measure how high")]
+        lengths = [line for line in summary["verdict"] if line.startswith("Next: measure the height")]
         assert len(lengths) == 1
     left = [path.name for path in Path(os.environ["XDG_RUNTIME_DIR"], "birdslam").iterdir()]
     assert left == ["car"]
