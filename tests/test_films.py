@@ -281,3 +281,28 @@ def test_damaged_metadata_say_nothing_or_a_focal_length(data: st.DataObject) -> 
         found = stated_focal_rel(path)
         assert found is None or 5.0 / 36.0 <= found <= 300.0 / 36.0
         assert why_unreadable(path)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("2024-01-01_10-00-00-front", "2024-01-01_10-00-00-back", "2024-01-01_10-00-00-left_repeater"),
+        ("20240131_120000_000123F", "20240131_120000_000124R"),
+        ("20240131_120000_NF_front", "20240131_120000_NR_rear"),
+    ],
+)
+def test_films_of_several_cameras_are_refused_with_their_names(tmp_path: Path, names: tuple[str, ...]) -> None:
+    for name in names:
+        film(tmp_path / f"{name}.mp4", range(0, 120, 40))
+    with pytest.raises(DatasetError, match="several cameras") as error:
+        open_recording(f"video:{tmp_path}", CAMERA)
+    pattern = str(error.value).partition("video:")[2]
+    assert len(open_recording(f"video:{pattern}", CAMERA)) == 3
+    with pytest.raises(DatasetError, match="has no films"):
+        open_recording(f"video:{tmp_path}/*-top*", CAMERA)
+
+
+def test_other_letters_of_names_are_no_cameras(tmp_path: Path) -> None:
+    for name in ("GX010123", "GX020123", "clipA", "driver", "forward"):
+        film(tmp_path / f"{name}.mp4", range(0, 120, 40))
+    assert len(open_recording(f"video:{tmp_path}", CAMERA)) == 15

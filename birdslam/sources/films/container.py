@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -76,20 +76,43 @@ def stated_focal_rel(path: Path) -> float | None:
     return None if focal_mm is None else focal_mm / FULL_FRAME_MM
 
 
+# A word (Tesla: 2024-01-01_10-00-00-left_repeater) or a letter after the number (Viofo, BlackVue: ..._000123F)
+_CAMERA = re.compile(
+    r"(?:(?<=[-_ ])|^)((?:left_|right_)?(?:front|back|rear|left|right|inside|interior|cabin|repeater|pillar))$"
+    r"|(?<=\d)_?([FRI])$",
+    re.IGNORECASE,
+)
+
+
 def natural(path: Path) -> list[tuple[int, int | str]]:
     """Sorts names with numbers as people do: film2 before film10."""
     return [(0, int(part)) if part.isdigit() else (1, part.lower()) for part in re.split(r"(\d+)", path.name) if part]
 
 
 def films_in(path: Path, suffixes: tuple[str, ...]) -> list[Path]:
-    """A film's file, or all of a directory in their natural order. Raises DatasetError."""
-    if not path.is_dir():
+    """A film's file, or those of a directory or of a pattern (`DIR/*front*`) in natural order. Raises DatasetError."""
+    if path.is_dir():
+        found: Iterable[Path] = path.iterdir()
+    elif "*" in path.name and not path.exists():
+        found = path.parent.glob(path.name)
+    else:
         return [path]
-    films = sorted((file for file in path.iterdir() if file.suffix.lower() in suffixes), key=natural)
+    films = sorted((file for file in found if file.suffix.lower() in suffixes), key=natural)
     films = [film for film in films if film.is_file() and not film.name.startswith(".")]  # ._ files of macOS
     if not films:
         raise DatasetError(f"{path}: has no films ({', '.join(suffixes)})")
+    cameras = {camera: film for film in films if (camera := camera_of_name(film))}
+    if len(cameras) > 1:
+        pattern = (path if path.is_dir() else path.parent) / f"*{next(iter(cameras))}{films[0].suffix}"
+        names = ", ".join(sorted(cameras))
+        raise DatasetError(f"{path}: has films of several cameras ({names}); name those of one: video:{pattern}")
     return films
+
+
+def camera_of_name(path: Path) -> str:
+    """The camera that a file name ends with, as recorders with several cameras write it; "": none."""
+    found = _CAMERA.search(path.stem)
+    return (found[1] or found[2]) if found else ""
 
 
 def _boxes_of_file(path: Path) -> Iterator[_Box]:
