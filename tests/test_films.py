@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -306,3 +307,27 @@ def test_other_letters_of_names_are_no_cameras(tmp_path: Path) -> None:
     for name in ("GX010123", "GX020123", "clipA", "driver", "forward"):
         film(tmp_path / f"{name}.mp4", range(0, 120, 40))
     assert len(open_recording(f"video:{tmp_path}", CAMERA)) == 15
+
+
+@pytest.mark.parametrize("name", ["film.mp4", "film.mkv", "film.avi"])
+@pytest.mark.parametrize("aspect", [Fraction(4, 3), Fraction(8, 9), Fraction(1, 1)])
+def test_pixels_of_anamorphic_films_are_made_square(tmp_path: Path, name: str, aspect: Fraction) -> None:
+    """A circle of the scene is a circle of the image."""
+    width, height, path = 144, 108, tmp_path / name
+    circle = cv2.circle(np.zeros((height, round(width * aspect), 3), np.uint8), (60, 54), 40, (255,) * 3, -1)
+    coded = cv2.resize(circle, (width, height), interpolation=cv2.INTER_AREA)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4" if path.suffix == ".avi" else "libx264", rate=30)
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        stream.codec_context.sample_aspect_ratio = aspect
+        for _ in range(3):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(coded, "bgr24")))
+        container.mux(stream.encode(None))
+    assert VideoRecording.frame_size(path, BagTopics()) == (round(width * aspect), height)
+    camera = Camera(round(width * aspect), height, 100.0, 100.0, 60.0, 54.0, height_m=1.5)
+    image = frames(path, camera)[1].image
+    assert image is not None
+    bright = image[..., 0] > 128
+    across, down = bright.any(axis=0).sum(), bright.any(axis=1).sum()
+    assert across == pytest.approx(80, abs=4)
+    assert down == pytest.approx(80, abs=4)

@@ -107,6 +107,7 @@ class VideoRecording(Recording):
     def _frames_of(self, film: _Film, index: int, begin_ns: int, last_ns: int, start: int) -> Iterator[RecordedFrame]:
         """One file's, numbered from `index` on; those before `start` are not decoded to an image."""
         capture = _capture(film.path)
+        square = _size(capture)
         try:
             position, shift_ns, t_ns = 0, begin_ns, last_ns
             while capture.grab():
@@ -121,6 +122,8 @@ class VideoRecording(Recording):
                     index += 1
                 if position % self._stride == 0:
                     ok, image = capture.retrieve() if index >= start else (False, None)
+                    if ok and image is not None and square != (image.shape[1], image.shape[0]):
+                        image = cv2.resize(image, square, interpolation=cv2.INTER_LINEAR)
                     error = None if ok else f"{film.path}: frame {position} can't be decoded"
                     yield RecordedFrame(index, t_ns, image if ok else None, error)  # type: ignore[arg-type]
                     index += 1
@@ -200,4 +203,15 @@ def _capture(path: Path) -> cv2.VideoCapture:
 
 
 def _size(capture: cv2.VideoCapture) -> tuple[int, int]:
-    return round(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), round(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+    """Width and height of an image with square pixels, as read and rotated by OpenCV.
+
+    The sample aspect ratio (width over height of a pixel as coded) of anamorphic films widens the image.
+    """
+    width, height = capture.get(cv2.CAP_PROP_FRAME_WIDTH), capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
+    over, under = capture.get(cv2.CAP_PROP_SAR_NUM), capture.get(cv2.CAP_PROP_SAR_DEN)
+    aspect = over / under if over > 0.0 and under > 0.0 else 1.0
+    if round(capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 180 == 90:
+        height *= aspect
+    else:
+        width *= aspect
+    return round(width), round(height)
