@@ -28,7 +28,14 @@ def main(arguments: list[str]) -> int:
 
     names = benchmark_modules()
     wanted = arguments[:1] if arguments and arguments[0] in names else names  # one that is named needs no other
-    modules = [importlib.import_module(names[name]) for name in wanted]
+    modules = []
+    for name in wanted:
+        try:
+            modules.append(importlib.import_module(names[name]))
+        except ModuleNotFoundError as error:  # the renderer is not part of the wheel
+            print(f"perf {name}: needs a checkout with the extra `dev`: {error.name} is missing", file=sys.stderr)
+            if arguments:
+                return USER_ERROR_STATUS
     benchmarks = {module.__name__.rpartition(".")[2]: module for module in modules if hasattr(module, "label")}
     if arguments and arguments[0] in benchmarks:
         try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -22,6 +23,7 @@ from birdslam.perf.latency.live import Run, Sample
 from birdslam.perf.reporting import all as everything
 from birdslam.perf.reporting import compare, ratios, report
 from birdslam.perf.reporting.figures import BLOCKS, Ledger, curve, noise, spread
+from birdslam.runtime.cli import main as birdslam
 from birdslam.runtime.transport.bus import Message
 from birdslam.runtime.wire import Stage, Trace
 from birdslam.types import Estimate, Status
@@ -344,3 +346,20 @@ def test_interrupting_the_suite_keeps_what_it_has(tmp_path: Path, monkeypatch: p
     assert "transport" not in kept["outcome"]
     assert kept["benchmarks"]["system"]["label"] == "system"
     assert "optimizer: interrupted" in (tmp_path / "report.md").read_text()
+
+
+def test_without_the_renderer_a_benchmark_and_the_demo_drive_say_what_is_missing(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """As from a wheel, which has neither `birdslam.world` nor `birdslam.runtime.world`."""
+    for name in [name for name in sys.modules if name.startswith(("birdslam.world", "birdslam.runtime.world"))]:
+        monkeypatch.delitem(sys.modules, name)
+    for name in ("birdslam.perf.accuracy.roads", "birdslam.runtime.world.demo_drive"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    monkeypatch.setitem(sys.modules, "birdslam.world", None)
+    monkeypatch.setitem(sys.modules, "birdslam.runtime.world", None)
+    assert main(["roads"]) == 2
+    assert birdslam.main(["demo-drive", "make", "--output", str(tmp_path)]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2
+    assert all("needs a checkout" in line and "world" in line for line in lines)

@@ -46,8 +46,7 @@ class VehicleHeightConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
     sigma_class_rel: Positive = 0.04  # of the mean height of a class on a country's roads, and of a detector's boxes
     sigma_bounce_rad: Positive = 0.008  # of the camera's pitch in one frame against its mean
     sigma_pitch_rad: Positive = 0.003  # of the mean: edges of boxes lie alike above the wheels' contact
-    # Of the mean roll: those on one side stand on the same crown, kerb or bank. By as much as 0.011 to 0.014 rad it
-    # differs from the road's own on KITTI 00, 0002 and 0005, by 0.05 in a street with a bank, by 0.12 in a hilly town
+    # Of the mean roll: vehicles on one side share the crown, curb or bank of the road
     sigma_crown_rad: Positive = 0.05
     gate_sigma: Positive = 3.0  # of a vehicle's residual; beyond it is left out
     min_vehicles: Annotated[int, msgspec.Meta(ge=2)] = 5

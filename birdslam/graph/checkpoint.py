@@ -26,7 +26,7 @@ _KINDS = {"<f8": np.float64, "<c16": np.complex128, "<i8": np.int64}
 
 
 class CheckpointError(ValueError):
-    """The bytes are no checkpoint that this graph can go on from; the message says why."""
+    """The bytes are not a checkpoint that this graph can continue from."""
 
 
 class Epoch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

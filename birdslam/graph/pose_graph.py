@@ -1,9 +1,7 @@
-"""The back end: the paper's incremental SE(2) pose graph (Eqs. 2-8), optimised once for each frame.
+"""The back end: the incremental SE(2) pose graph of the paper (Eqs. 2-8), optimized once per frame.
 
-`PoseGraph.optimise` reads like this: Eq. 4 weighs the edges (weights.py); the factors move the window on to the frame;
-they linearise their edges, and the minimum of their sum, Eq. 8, is found (minimum.py); vehicles and landmarks come and
-go. marginals.py gives the frame's estimates. What the terms of Eq. 8 are stands in factors/, a module for each. The
-feedback of each result into the next frame is the paper's "incremental approach".
+`PoseGraph.optimise` weights the edges (Eq. 4), propagates the window, linearizes the factors, minimizes their sum
+(Eq. 8), adds and removes vehicles and landmarks, and returns the marginals. Each factor is a module of factors/.
 """
 
 from __future__ import annotations
@@ -173,7 +171,7 @@ class PoseGraph:
     ) -> PoseGraph:
         """The graph of a `checkpoint`, which goes on with the very bytes that the one it was taken of would give.
 
-        Raises CheckpointError, which says why, for bytes that are torn, no checkpoint, or one of other settings.
+        Raises CheckpointError for bytes that are torn, that are no checkpoint, or that have other settings.
         """
         graph = PoseGraph(config, weights, factors=factors)
         checkpoint = unpack(data, graph.settings)

@@ -39,7 +39,7 @@ _Number = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
 
 
 class MapError(ValueError):
-    """The bytes are no map that can be used; the message says why."""
+    """The bytes are not a usable map."""
 
 
 class PieceRecord(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
@@ -139,7 +139,7 @@ def decode_map(data: bytes) -> PlaceMap:
         reads = " and ".join(map(str, READ))
         raise MapError(f"is of version {version}, and this BirdSLAM reads versions {reads}: drive it again")
     if length > MAX_BYTES:
-        raise MapError(f"says that it has {length} bytes: more than {MAX_BYTES}")
+        raise MapError(f"declares {length} bytes, more than the limit of {MAX_BYTES}")
     if len(data) - head != length:
         raise MapError(f"is torn: it has {len(data) - head} bytes behind its head in place of {length}")
     body = data[head:]

@@ -25,7 +25,7 @@ POINT_SIGMA_PX = 1.0
 
 
 class MergeError(ValueError):
-    """The maps can't be made one; the message says why."""
+    """The maps cannot be merged."""
 
 
 def merged(first: PlaceMap, second: PlaceMap) -> tuple[PlaceMap, int]:

@@ -50,7 +50,7 @@ class MapCamera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def differs(self, camera: Camera) -> str:
         """How another camera is another one: in what a corner looks like, or in metres; "" where it is not."""
         if abs(math.log(self.height_m / camera.height_m)) > OTHER_HEIGHT:
-            return f"it stands {camera.height_m:g} m over the road, the map's stood at {self.height_m:g} m"
+            return f"its height is {camera.height_m:g} m, that of the map's camera {self.height_m:g} m"
         per_px = self.fx_px / self.width_px / (camera.fx_px / camera.width_px)
         if abs(math.log(per_px)) > OTHER_FOCAL_LENGTH:
             return (

@@ -47,7 +47,7 @@ def onnxruntime_version() -> str:
 
 
 class ProviderMissing(Exception):
-    """The provider is not in this onnxruntime, or does not begin on this computer; says which."""
+    """The provider is not part of this onnxruntime, or does not start on this computer."""
 
 
 def providers_here() -> tuple[str, ...]:

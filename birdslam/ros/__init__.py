@@ -2,5 +2,5 @@
 
 `bag` reads ROS 1 and ROS 2 bags, `sensor` turns their images, cameras, speeds and fixes into ours, `frames` has their
 static transforms. `messages` are our records as ROS messages, of the types of `message_types`; `bag_writer` writes them
-to a bag, `rmw_zenoh` names them for a live ROS 2. What can't be used raises `bag.BagError`, which says why.
+to a bag, `rmw_zenoh` names them for a live ROS 2. Unusable input raises `bag.BagError`.
 """

@@ -96,9 +96,9 @@ class RosbagRecording(Recording):
         found = _camera(bag, self._topics)
         if found.mount is None:
             raise BagError(
-                f"{self._path}: nothing in it says how high the camera stands over the road (no /tf_static from "
-                f"base_footprint or base_link to {found.frame or 'a frame that the images name'}): a camera file is "
-                f"needed (--camera FILE): `birdslam calibrate rosbag:{self._path} --height M --output FILE` writes one"
+                f"{self._path}: the height of the camera above the road is missing (no /tf_static from "
+                f"base_footprint or base_link to {found.frame or 'a frame that the images name'}); give a camera file "
+                f"(--camera FILE): `birdslam calibrate rosbag:{self._path} --height M --output FILE` writes one"
             )
         mount = msgspec.structs.asdict(found.mount)
         try:

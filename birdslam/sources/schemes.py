@@ -120,7 +120,7 @@ def scheme_of(uri: str, schemes: Sequence[Scheme]) -> Scheme | None:
 
 
 def parse(uri: str, schemes: Sequence[Scheme]) -> tuple[Scheme, str]:
-    """The scheme and the address of a URI. Raises ValueError, which says what there is."""
+    """Returns the scheme and the address of a URI. Raises ValueError with the known schemes."""
     scheme, (name, colon, address) = scheme_of(uri, schemes), uri.partition(":")
     if scheme is None:
         raise ValueError(f"{uri}: no such source {name + colon!r}; there are {written(schemes)}")

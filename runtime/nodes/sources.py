@@ -97,7 +97,7 @@ def open_recorded(
 
 
 def parsed(uri: str) -> tuple[Scheme, str]:
-    """The scheme of any source, and its address. Raises ConfigurationError, which says what there is."""
+    """Returns the scheme and the address of a source. Raises ConfigurationError with the known schemes."""
     try:
         return parse(uri, all_schemes())
     except ValueError as error:

@@ -26,7 +26,7 @@ _OWN = "own-"  # then a process' number: the runtime directory of one that drive
 
 
 class VehicleBusy(RuntimeError):
-    """Another instance runs under this vehicle's name; says which process, and by which file."""
+    """Another instance runs under the name of this vehicle; names its process and lock file."""
 
 
 def runtime_dir_of(vehicle: str, runtime_dir: Path | None = None) -> Path:

@@ -32,7 +32,7 @@ Image = NDArray[np.uint8]
 
 
 class FrameError(ValueError):
-    """An image that does not fit the ring, or a file that is no ring; says which and why."""
+    """An image does not fit the ring, or a file is not a ring."""
 
 
 def _slot_bytes(height_px: int, width_px: int, channels: int) -> int:

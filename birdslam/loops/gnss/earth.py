@@ -49,7 +49,7 @@ def is_on_earth(latitude_deg: float, longitude_deg: float) -> bool:
 
 
 class EarthError(ValueError):
-    """The fixes can't place the drive; the message says why."""
+    """The fixes do not determine the pose of the drive on Earth."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,7 @@ COLUMNS = "time_s, latitude_deg, longitude_deg, and where known sigma_m, speed_m
 
 
 class GnssError(ValueError):
-    """The file holds no fixes that can be used; the message says why."""
+    """The file has no usable fixes."""
 
 
 def read_fixes(data: bytes, name: str, begin_ns: int) -> list[GnssFix]:
