@@ -1,4 +1,4 @@
-"""The way of a drive, pose by pose, each by the keyframe nearest to it: it moves with that. Its memory never grows."""
+"""The trajectory of a drive in bounded memory: each pose is relative to its nearest keyframe and moves with it."""
 
 from __future__ import annotations
 

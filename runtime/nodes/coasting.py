@@ -1,7 +1,7 @@
 """Frames whose measurements are late: the optimizer publishes a prediction with a growing covariance.
 
-A planner gets an estimate of each frame within its budget, whether perceive is dead, stalled or merely slow. Nothing of
-it enters the graph: when the measurements come after all, it goes on as if they had come in time.
+A planner gets an estimate of each frame within its latency budget, also if perceive is dead, stalled or slow. The
+prediction does not enter the graph; late measurements are added as if they had arrived in time.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Scheduling and memory of a node's process, as far as the system permits; set when its work begins.
+"""Scheduling and memory of a node's process, as far as the system permits; applied when its work starts.
 
-It holds for the threads that exist (the networks', OpenCV's), and later ones inherit it (zenoh's): a spare that still
-loads must not go before the nodes at work.
+The settings apply to all existing threads (networks, OpenCV); threads that start later inherit them (zenoh). A spare
+that is still loading keeps its lower priority, so that it does not delay the active nodes.
 """
 
 from __future__ import annotations
@@ -22,34 +22,32 @@ from birdslam.runtime.slices import wake_soon
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 _CAP_IPC_LOCK, _CAP_SYS_NICE = 14, 23
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # of mallopt(3)
-_OBJECT_BYTES, _ANCHORED = 400, 256  # of Python's small objects, and how many in a row have one that stays
+_OBJECT_BYTES, _ANCHORED = 400, 256  # size of a small Python object; one in so many is kept
 _MIB = 1 << 20
 
-# Nodes that compute for 2 ms of a frame and then wait: they may preempt the networks, and never the other way round. On
-# two cores, beside perceive alone, a step of the optimizer took p99 2.3 to 4.6 ms at SCHED_FIFO, 4.5 to 11.8 at nice -5
+# These nodes compute for about 2 ms per frame, so they may preempt the networks
 _FIRST, _FIRST_NICE = ("capture", "optimize"), -5
-# Of perceive the thread of the frames, and the bus's, which it begins; its networks get what is left, a core or more.
-# It works for 10 ms of a frame: at SCHED_FIFO the kernel, which sees no load in that, wakes planners behind it. On two
-# cores beside a load of 11 a planner had an estimate p99 29 to 80 ms after it was sent; with this nice value 26 to 47,
-# with a short slice of this thread and of the planner's 7 and 14, the age at the planner p99 74 to 124 and 63, 86 ms
+# The frame thread of perceive and the bus threads that it starts; the networks get the remaining time, at least a core.
+# A nice value instead of SCHED_FIFO: this thread works for about 10 ms per frame, and the kernel does not count FIFO
+# threads as load, so it would wake planners on the same core
 _FRAMES, _FRAMES_CORES, _FRAMES_NICE = "perceive", 2.0, -20
 _MIN_PERIOD_MS = 10.0  # of frames, for SCHED_FIFO: at more than 100 Hz they would leave no core to the others
-_LOWER_NICE = 5  # nicer: a third of the time that one gets that wants the same core and is not
+_LOWER_NICE = 5  # a third of the CPU time of a thread with the default nice value
 _NICEST = 19
 
-NODE_IMAGES = {"capture": 8, "perceive": 40}  # of the camera's size, in colour, that a node has at once at its worst
-# ... and what does not go by the image: in perceive lane grids, and what networks, OpenCV and the solvers hold
+NODE_IMAGES = {"capture": 8, "perceive": 40}  # maximum number of colour images of the camera's size that a node holds
+# Memory independent of the image size: in perceive, lane grids and buffers of the networks, OpenCV and the solvers
 NODE_OBJECTS_MIB, NODE_HEAP_MIB = 8.0, {"perceive": 24.0}
-OTHER_HEAP_MIB = 4.0  # of a node that is not named there
+OTHER_HEAP_MIB = 4.0  # of all other nodes
 
-_TUPLE_SIZES, _TUPLES_KEPT = range(1, 21), 2_000  # what CPython keeps of freed ones, of each size
+_TUPLE_SIZES, _TUPLES_KEPT = range(1, 21), 2_000  # sizes and count per size of CPython's free lists
 
-_usual_nice: list[int] = []  # of the networks, where the frames' thread has one of its own
-_anchors: list[bytes] = []  # for ever: memory that holds one of these is not given back
+_usual_nice: list[int] = []  # nice value of the networks, if the frame thread has its own
+_anchors: list[bytes] = []  # never freed: an arena with one of these is not returned to the system
 
 
 def apply(node: str, configuration: Configuration) -> Iterator[str]:
-    """Sets what is configured; gives a line for each setting that the system refused."""
+    """Applies the configured settings; yields a message for each setting that the system refused."""
     realtime, live = configuration.realtime, configuration.live
     scheduling = realtime.of(node)
     if scheduling.cpus:
@@ -69,7 +67,7 @@ def apply(node: str, configuration: Configuration) -> Iterator[str]:
     if every and not by_fifo:
         yield "realtime.fifo: SCHED_FIFO is not permitted (LimitRTPRIO=, CAP_SYS_NICE): runs at normal priority"
     if first and not by_fifo:
-        with contextlib.suppress(PermissionError):  # who may not: these wait for a core like the others
+        with contextlib.suppress(PermissionError):  # without permission the default priority remains
             for thread in _threads():
                 os.setpriority(os.PRIO_PROCESS, thread, _FIRST_NICE)
             _set_session_nice("self", _FIRST_NICE)
@@ -81,7 +79,7 @@ def apply(node: str, configuration: Configuration) -> Iterator[str]:
 
 
 def _by_fifo(threads: Iterable[int], priority: int) -> bool:
-    """Runs these threads, and those that they begin, at SCHED_FIFO; False where that is not permitted."""
+    """Runs these threads, and those that they start, at SCHED_FIFO; returns False if that is not permitted."""
     try:
         for thread in threads:
             os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
@@ -91,17 +89,17 @@ def _by_fifo(threads: Iterable[int], priority: int) -> bool:
 
 
 def _frames_first() -> None:
-    """The calling thread, and those that it begins, go before the networks."""
+    """Gives the calling thread, and those that it starts, priority over the networks."""
     thread = threading.get_native_id()
     usual = os.getpriority(os.PRIO_PROCESS, thread)
-    with contextlib.suppress(PermissionError):  # who may not: it waits for a core like the others
+    with contextlib.suppress(PermissionError):  # without permission the default priority remains
         os.setpriority(os.PRIO_PROCESS, thread, _FRAMES_NICE)
         wake_soon([thread])
         _usual_nice.append(usual)
 
 
 def below_frames() -> None:
-    """The calling thread runs a network that frames wait for: as any other where the frames' thread goes first."""
+    """Gives the calling thread, which runs a network, the default nice value if the frame thread has a higher one."""
     if _usual_nice:
         thread = threading.get_native_id()
         os.setpriority(os.PRIO_PROCESS, thread, _usual_nice[0])
@@ -109,10 +107,10 @@ def below_frames() -> None:
 
 
 def as_frames() -> None:
-    """The calling thread shares the interpreter's lock with the frames, and computes between them.
+    """Keeps the calling thread at the priority of the frame thread, with which it shares the interpreter lock.
 
-    Were it to wait for a core while it holds the lock, so would the frames: it goes before the networks as they do. It
-    has that from the frames' thread, which began it. At SCHED_FIFO it is one below, since there none of them waits.
+    If it waited for a core while holding the lock, the frame thread would wait too. It inherits its priority from the
+    frame thread, which starts it. At SCHED_FIFO it runs one level lower.
     """
     if os.sched_getscheduler(0) == os.SCHED_FIFO:
         lower_priority()
@@ -131,11 +129,10 @@ def lower_priority() -> None:
 
 
 def lower_to_idle(pid: int) -> None:
-    """The process `pid`, just started as a session of its own, loads where nobody else wants a core: loading a spare
-    must not cost frames.
+    """Runs the process `pid`, just started in its own session, on idle cores, so that a loading spare delays no frame.
 
-    What it could not come back from (RLIMIT_NICE, CAP_SYS_NICE) is left out. A session's nice value anybody may raise
-    to 0 again; but it counts only outside of control groups (a desktop, not a service).
+    SCHED_IDLE is skipped if the process lacks the permission to leave it (RLIMIT_NICE, CAP_SYS_NICE). Users may raise
+    a session's nice value to 0 again, but it has an effect only outside of control groups (a desktop, not a service).
     """
     _set_session_nice(pid, _NICEST)
     limit = resource.getrlimit(resource.RLIMIT_NICE)[0]
@@ -146,7 +143,7 @@ def lower_to_idle(pid: int) -> None:
 
 
 def raise_from_idle(pid: int) -> None:
-    """Ends `lower_to_idle`: all its threads, and those that they begin meanwhile, get this process's scheduling."""
+    """Reverts `lower_to_idle`: gives all threads of `pid`, including new ones, the scheduling of this process."""
     _set_session_nice(pid, 0)
     policy, param = os.sched_getscheduler(0), os.sched_getparam(0)
     done: set[int] = set()
@@ -159,34 +156,34 @@ def raise_from_idle(pid: int) -> None:
 
 
 def _set_session_nice(pid: int | str, nice: int) -> None:
-    """Gives a process's session a nice value, where the kernel weighs sessions against each other (autogroup(7)).
+    """Sets the nice value of a process's session, if the kernel schedules by session (autogroup(7)).
 
-    There a thread's own nice value and SCHED_IDLE count inside of its session alone.
+    In that case a thread's nice value and SCHED_IDLE apply only within its session.
     """
     for last in (False, True):
         try:
             with open(f"/proc/{pid}/autogroup", "w") as group:
                 group.write(str(nice))
             return
-        except BlockingIOError:  # the kernel lets users do this ten times a second
+        except BlockingIOError:  # the kernel limits users to ten writes per second
             if not last:
                 time.sleep(0.1)
-        except OSError:  # no such kernel, not permitted, or it has ended: it computes like the others
+        except OSError:  # no autogroups, not permitted, or the process has ended
             return
 
 
 def reserve_for(node: str, configuration: Configuration) -> None:
-    """`reserve` for what a node makes at work, when all that it loads is there."""
+    """Reserves the working memory of a node; call it after the node has loaded everything."""
     camera = configuration.camera
     image_mib = 0.0 if camera is None else 3 * camera.width_px * camera.height_px / _MIB
     reserve(NODE_OBJECTS_MIB, NODE_HEAP_MIB.get(node, OTHER_HEAP_MIB) + NODE_IMAGES.get(node, 0) * image_mib)
 
 
 def use_one_heap() -> None:
-    """All threads allocate from one heap (glibc's), which keeps freed memory.
+    """Makes all threads allocate from one glibc heap, which keeps freed memory.
 
-    Call it before the process has threads: a heap that one of them has begun goes on growing. The nodes have it from
-    their environment (`cli.ENVIRONMENT`), which the process that sets it has read too early.
+    Call it before the process starts threads, since an existing heap of a thread continues to grow. The nodes get the
+    same settings from their environment (`cli.ENVIRONMENT`), which is set too late for the process that sets it.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
@@ -196,11 +193,10 @@ def use_one_heap() -> None:
 
 
 def reserve(objects_mib: float, heap_mib: float) -> None:
-    """Takes memory for so much of small objects and of larger blocks now, for this process to fill later.
+    """Reserves memory for small objects and for larger blocks, in MiB, and touches its pages.
 
-    What grows up to a bound then grows into memory that is there, and its pages do not fault in the middle of a drive.
-    It serves every thread where `use_one_heap` was called before the first of them; without glibc it reserves objects
-    alone.
+    Bounded growth during a drive then causes no page faults. The reserve serves all threads if `use_one_heap` is called
+    before the first one starts; without glibc it covers small objects only.
     """
     use_one_heap()
     small = [bytes(_OBJECT_BYTES) for _ in range(round(objects_mib * _MIB / _OBJECT_BYTES))]
@@ -211,9 +207,9 @@ def reserve(objects_mib: float, heap_mib: float) -> None:
 
 
 def freeze_objects() -> None:
-    """Takes what was built out of garbage collection, and fills Python's store of freed tuples.
+    """Excludes existing objects from garbage collection and fills CPython's free lists of tuples.
 
-    CPython keeps freed tuples for later. A drive that fills this store alone, some 4 MiB, grows for half an hour.
+    Otherwise these lists, about 4 MiB, fill slowly during a drive.
     """
     gc.collect()
     gc.freeze()
@@ -222,18 +218,18 @@ def freeze_objects() -> None:
 
 
 def _threads(pid: int | str = "self") -> list[int]:
-    with contextlib.suppress(FileNotFoundError):  # another one, which has ended
+    with contextlib.suppress(FileNotFoundError):  # the process has ended
         return [int(name) for name in os.listdir(f"/proc/{pid}/task")]
     return []
 
 
 def may_lock_memory() -> bool:
-    """Without a limit: under one, a locked process would fail where it first needs more."""
+    """Whether memory can be locked without a limit; with a limit, later allocations of a locked process would fail."""
     return resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY or has_capability(_CAP_IPC_LOCK)
 
 
 def has_capability(capability: int) -> bool:
-    """Whether this process has one of the kernel's capabilities now, by its number."""
+    """Whether this process has the capability(7) of this number in its effective set."""
     with open("/proc/self/status") as status:
         for line in status:
             if line.startswith("CapEff:"):

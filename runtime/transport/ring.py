@@ -1,9 +1,8 @@
 """Images between processes: a ring of slots in shared memory, one writer, any number of readers.
 
-The writer never waits: a reader that is slower than `slots - 1` frames finds its frame overwritten, and gets None. A
-slot is guarded by a sequence lock (odd while it is written) and by a checksum over the pixels, their shape and the
-sequence: `FrameReader.read` copies first and verifies afterwards. The file is made under another name and renamed; a
-writer that starts again replaces it under a new `epoch`, which readers see in FrameRef.ring_epoch.
+The writer never waits; a reader that lags by more than `slots - 1` frames gets None. A sequence lock (odd during a
+write) and a checksum over pixels, shape and sequence protect each slot; `FrameReader.read` copies, then verifies. A
+restarted writer replaces the file atomically, with a new `epoch` (FrameRef.ring_epoch).
 """
 
 from __future__ import annotations
@@ -20,19 +19,19 @@ from birdslam.runtime.transport.closing import Closing
 from birdslam.types import FrameRef
 
 _MAGIC = int.from_bytes(b"BIRDRING", "little")
-_LAYOUT = 1  # raise it where the layout below changes
+_LAYOUT = 1  # increment when the layout below changes
 _HEAD_WORDS = 8  # magic, layout, epoch, slots, bytes of a slot, then the largest frame: height, width, channels
 _SLOT_WORDS = 8  # sequence, height, width, channels, checksum; the rest is spare. The pixels follow
 _WORD_BYTES = 8
 _MAX_SIDE_PX = 16_384
 _MAX_SLOTS = 64
-_MIX = 0x9E3779B97F4A7C15  # odd, so that it spreads each number of a slot's head over the whole checksum
+_MIX = 0x9E3779B97F4A7C15  # odd multiplier that spreads each number of a slot's head over all bits
 
 Image = NDArray[np.uint8]
 
 
 class FrameError(ValueError):
-    """An image does not fit the ring, or a file is not a ring."""
+    """An image that does not fit the ring, or a file that is not a ring."""
 
 
 def _slot_bytes(height_px: int, width_px: int, channels: int) -> int:
@@ -40,13 +39,11 @@ def _slot_bytes(height_px: int, width_px: int, channels: int) -> int:
     return _WORD_BYTES * _SLOT_WORDS + -(-pixels_bytes // 64) * 64
 
 
-# Why a lock and a checksum. On x86-64 stores are seen in their order and loads are made in theirs (memcpy fences the
-# streaming stores that it uses for large blocks), each sequence is one aligned 8-byte store, and Python's separate
-# calls keep the compiler from moving them: the sequence lock alone would do. On machines of weaker order (ARM) it would
-# not, and Python has no fences; there the checksum decides, since it is taken from the very bytes that are handed out.
-# It costs about 20 us for a 1.4 MB image, so it is taken everywhere.
+# On x86-64 the sequence lock suffices: stores and loads keep their order, and each sequence is one 8-byte store.
+# On a weaker memory model (ARM) it does not, and Python has no fences; the checksum over the copied bytes detects torn
+# frames there. It costs about 20 us for a 1.4 MB image, so it is verified on all machines.
 def _checksum(pixels: Image, sequence: int, height_px: int, width_px: int, channels: int) -> int:
-    """Of a flat, contiguous array of pixels and of the head that describes them."""
+    """Returns the checksum of a flat, contiguous array of pixels and of the head that describes them."""
     whole = pixels.size // _WORD_BYTES * _WORD_BYTES
     total = int(np.add.reduce(pixels[:whole].view(np.uint64))) + int(np.add.reduce(pixels[whole:], dtype=np.uint64))
     for number in (sequence, height_px, width_px, channels):
@@ -60,7 +57,7 @@ def _check_frame(height_px: int, width_px: int, channels: int) -> None:
 
 
 class _Mapping:
-    """The file of a ring in memory, as words and as bytes; the same for both sides."""
+    """The memory-mapped file of a ring, as words and as bytes, for writer and reader."""
 
     def __init__(self, fd: int, size: int, writable: bool) -> None:
         access = mmap.PROT_READ | mmap.PROT_WRITE if writable else mmap.PROT_READ
@@ -72,7 +69,7 @@ class _Mapping:
         return [int(word) for word in self.words[:_HEAD_WORDS]]
 
     def slot(self, slot: int, slot_bytes: int) -> tuple[NDArray[np.uint64], Image]:
-        """The head and the pixels of one slot, as views."""
+        """Returns views of the head and the pixels of one slot."""
         start = _WORD_BYTES * _HEAD_WORDS + slot * slot_bytes
         head = start // _WORD_BYTES
         pixels = self.bytes[start + _WORD_BYTES * _SLOT_WORDS : start + slot_bytes]
@@ -80,10 +77,10 @@ class _Mapping:
 
 
 class FrameRing(Closing):
-    """The writer's side: makes the ring at `path`, sized by the camera's largest frame; a context manager.
+    """Creates and writes the ring at `path`, sized for the camera's largest frame; a context manager.
 
-    Replaces what a dead process left there (VehicleLock keeps a second writer away), and removes its file on close.
-    Raises FrameError for sizes that no camera has, OSError naming the path where there is no room.
+    Replaces the file of a dead process (VehicleLock excludes a second writer) and removes its own file on close.
+    Raises FrameError for an implausible frame size, and OSError with the path if there is not enough memory.
     """
 
     def __init__(self, path: Path, height_px: int, width_px: int, channels: int = 3, slots: int = 8) -> None:
@@ -101,7 +98,7 @@ class FrameRing(Closing):
         try:
             try:
                 os.posix_fallocate(fd, 0, size)
-            except OSError as error:  # better now than a SIGBUS in the middle of a drive
+            except OSError as error:  # fail here instead of with a SIGBUS on the first write
                 raise OSError(error.errno, f"no room for a ring of {size} B: {error.strerror}", str(path)) from error
             self._mapping: _Mapping | None = _Mapping(fd, size, writable=True)
             head = (_MAGIC, _LAYOUT, self.epoch, slots, self._slot_bytes, *self._limits)
@@ -113,9 +110,9 @@ class FrameRing(Closing):
             draft.unlink(missing_ok=True)
 
     def write(self, image: Image) -> tuple[int, int]:
-        """Puts an image, (H, W) or (H, W, 3) uint8, into the next slot; gives (slot, sequence) for its FrameRef.
+        """Writes an image, (H, W) or (H, W, 3) uint8, into the next slot; returns (slot, sequence) for its FrameRef.
 
-        Raises FrameError for an image that is not of this kind, or larger than the ring was made for.
+        Raises FrameError for another shape or type, and for an image larger than the ring's frame size.
         """
         if self._mapping is None:
             raise FrameError(f"the ring {self.path} is closed")
@@ -139,7 +136,7 @@ class FrameRing(Closing):
         return slot, sequence
 
     def close(self) -> None:
-        """Removes the ring; frames that were not yet read are gone. A second call does nothing."""
+        """Removes the ring with its unread frames. A second call does nothing."""
         if self._mapping is None:
             return
         self._mapping = None
@@ -147,11 +144,11 @@ class FrameRing(Closing):
             if self.path.stat().st_ino == self._inode:  # else a newer writer has replaced it
                 self.path.unlink()
         except FileNotFoundError:
-            return  # somebody cleaned up before us
+            return
 
 
 class FrameReader(Closing):
-    """The reader's side. It may be made before the ring, and outlives its writers; a context manager."""
+    """Reads the ring at `path`, which need not exist yet; survives restarts of the writer. A context manager."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -159,10 +156,10 @@ class FrameReader(Closing):
         self._epoch = self._slots = self._slot_bytes = 0
 
     def read(self, ref: FrameRef, out: Image | None = None) -> Image | None:
-        """A copy of the pixels of `ref`, (H, W) or (H, W, 3); None where they are gone, torn, or never were there.
+        """Returns a copy of the pixels of `ref`, (H, W) or (H, W, 3), or None if they are overwritten, torn or missing.
 
-        With `out`, contiguous and of the frame's shape, they are copied there; what it holds after a None is no frame.
-        Raises FrameError for another shape of `out`, and where the file is no ring of this layout.
+        Copies into `out` if given (contiguous, of the frame's shape); after None its content is undefined.
+        Raises FrameError for another shape of `out`, and if the file is not a ring of this layout.
         """
         if ref.slot < 0 or (ref.ring_epoch != self._epoch and not self._open(ref.ring_epoch)):
             return None
@@ -185,7 +182,7 @@ class FrameReader(Closing):
         return out
 
     def _open(self, epoch: int) -> bool:
-        """Maps the ring that is at the path now; whether it is the one of `epoch`."""
+        """Maps the current ring at the path; returns whether its epoch is `epoch`."""
         try:
             fd = os.open(self.path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
         except FileNotFoundError:
@@ -208,5 +205,5 @@ class FrameReader(Closing):
         return True
 
     def close(self) -> None:
-        """Lets go of the ring."""
+        """Unmaps the ring."""
         self._mapping, self._epoch = None, 0
