@@ -19,10 +19,9 @@ NONE = -1  # in place of a keyframe's number: there was none near, and the pose 
 
 
 class HeldWay:
-    """`add` takes each pose in the map; `places` gives those that are kept.
+    """`add` takes each pose in the map; `places` returns the kept ones.
 
-    They lie in two arrays as long as the longest way, written at the start: as objects they were what the map process
-    gained in memory, 300 bytes a metre.
+    Two arrays of fixed size hold them, so that the map process does not grow during a drive.
     """
 
     def __init__(self) -> None:
@@ -33,7 +32,7 @@ class HeldWay:
         self._last: SE2 | None = None  # of them, in the map
 
     def add(self, estimate: Estimate, T_map_ego: SE2, place_map: PlaceMap) -> None:
-        """The next pose, where it is further on than the one before by what a kept one stands for."""
+        """Adds a pose if its distance from the last kept one exceeds the spacing."""
         last = self._last
         if last is not None and math.hypot(T_map_ego.x_m - last.x_m, T_map_ego.y_m - last.y_m) < self._every_m:
             return
@@ -53,7 +52,7 @@ class HeldWay:
             self._every_m *= 2.0
 
     def places(self, place_map: PlaceMap) -> list[Place]:
-        """The drive's way, as the map's keyframes lie now."""
+        """Returns the trajectory for the current poses of the map's keyframes."""
         at = {keyframe.number: keyframe.T_map_keyframe for keyframe in place_map.keyframes} | {NONE: SE2()}
         rows = zip(self._numbers[: self._length].tolist(), self._poses[: self._length].tolist(), strict=True)
         return [

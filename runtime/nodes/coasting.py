@@ -21,13 +21,13 @@ REPORTED_LATE = frozenset({Status.GRAPH_RESET, Status.GRAPH_RESTORED})
 
 
 class Overdue(msgspec.Struct, frozen=True):
-    """A frame that capture has announced, and whose measurements are late."""
+    """A frame announced by capture whose measurements are late."""
 
     ref: FrameRef
 
 
 class PendingFrames:
-    """The frames that capture has announced and perceive has not answered, oldest first."""
+    """The frames announced by capture and not yet answered by perceive, oldest first."""
 
     def __init__(self, deadline_ns: int) -> None:
         self._deadline_ns = deadline_ns  # from a frame's capture on
@@ -35,24 +35,24 @@ class PendingFrames:
         self._answered_frame = -1
 
     def add(self, message: Message) -> None:
-        """One more; END_OF_SOURCE is no frame, and an answer may be taken up before the frame that it answers."""
+        """Adds a frame, unless it is END_OF_SOURCE or its answer has already arrived."""
         if Status.END_OF_SOURCE not in message.record.status and message.record.frame_id > self._answered_frame:
             self._waiting.append(message)
 
     def answered(self, frame_id: int) -> None:
-        """This frame is, and with it all before it: perceive goes in their order, and leaves some out."""
+        """Removes this frame and all earlier ones, since perceive answers in order and may drop frames."""
         self._answered_frame = max(self._answered_frame, frame_id)
         while self._waiting and self._waiting[0].record.frame_id <= frame_id:
             self._waiting.popleft()
 
     def wait_s(self, now_ns: int) -> float:
-        """How long until one is overdue, as far as is known; never longer than the deadline itself."""
+        """Returns the time until a frame is overdue, in s, at most the deadline."""
         if not self._waiting:
             return self._deadline_ns / 1e9
         return max(0.0, (self._waiting[0].record.t_capture_ns + self._deadline_ns - now_ns) / 1e9)
 
     def overdue(self, now_ns: int) -> Message | None:
-        """The newest frame that is, as Overdue; those before it are not reported any more."""
+        """Returns the newest overdue frame as Overdue and discards the earlier ones; None if no frame is overdue."""
         newest = None
         while self._waiting and now_ns - self._waiting[0].record.t_capture_ns >= self._deadline_ns:
             newest = self._waiting.popleft()
@@ -60,16 +60,16 @@ class PendingFrames:
 
 
 def deadline_ns(configuration: Configuration) -> int:
-    """By when measurements must have come, for an estimate to reach the planner within the budget end to end."""
+    """Returns the latest arrival of measurements after capture, in ns, that meets the end-to-end budget."""
     budgets = configuration.budgets
     return round((budgets.end_to_end_ms - budgets.optimize_ms - budgets.optimize_to_planner_ms) * 1e6)
 
 
 def unmeasured(ref: FrameRef, last: Estimate | None, max_ns: int) -> Measurements:
-    """Stands in for a frame's measurements meanwhile; `last` is the last estimate that rests on some.
+    """Predicts an estimate for a frame without measurements; `last` is the last estimate with measurements.
 
-    What made that one invalid still holds, and after `max_ns` of source time without measurements all is. The ego's
-    height and tilt are those of that one.
+    It keeps the height, the tilt and the invalidating statuses of `last`, and is invalid after `max_ns` of source time
+    without measurements.
     """
     status = [*ref.status, Status.COASTING, Status.PERCEPTION_LATE]
     if last is None:
@@ -83,7 +83,7 @@ def unmeasured(ref: FrameRef, last: Estimate | None, max_ns: int) -> Measurement
 
 
 def with_unreported(estimate: Estimate, unreported: tuple[Status, ...]) -> Estimate:
-    """The estimate with statuses that were not reported yet; of GRAPH_RESET and GRAPH_RESTORED the former alone."""
+    """Returns the estimate with the unreported statuses added; GRAPH_RESET replaces GRAPH_RESTORED."""
     status = tuple(dict.fromkeys((*estimate.status, *unreported)))
     if Status.GRAPH_RESET in status:
         status = tuple(s for s in status if s != Status.GRAPH_RESTORED)

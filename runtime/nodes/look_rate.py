@@ -1,9 +1,8 @@
-"""How often the networks look: what this computer carries, measured at the start, and less of it under load.
+"""Inference rate of the networks: set at the start from measured run times, reduced under load.
 
-A frame that comes while perceive is still at the one before waits, and is only predicted if a next one comes. So before
-frames are late, the networks look at fewer of them: vehicles are followed and predicted between two looks, and the
-ego's motion is measured in every frame. This goes before the modes of degradation.py, which judge the age of what goes
-out: frames that are left out keep that low.
+A lower rate prevents late and dropped frames. Vehicles are tracked and predicted between two inferences; ego motion is
+measured in every frame. This acts before the modes of degradation.py, which judge the age of estimates, because
+dropped frames keep that age low.
 """
 
 from __future__ import annotations
@@ -20,22 +19,22 @@ from numpy.typing import NDArray
 from birdslam.geometry.camera import Camera
 from birdslam.runtime.configuration import LooksConfig
 
-MIN_RUNS = 3  # of a network that is measured; its first is not counted
-MASKS_SPARING = 2  # looks that are spared are for boxes; masks, which change more slowly, come with one in so many
-FRONT_END_CORES = 1.25  # what the frames themselves keep busy: one core in perceive, a part of another elsewhere
+MIN_RUNS = 3  # timed runs of each network, after a warm-up run
+MASKS_SPARING = 2  # at a reduced rate, masks are computed on every n-th inference
+FRONT_END_CORES = 1.25  # load of the front end: one core in perceive, a part of another in other nodes
 
 
 @dataclass(frozen=True)
 class Cost:
-    """Of one run of a network."""
+    """The cost of one run of a network."""
 
     ms: float
     threads: int
-    every: int  # as its schedule has it
-    boxes_ms: float | None = None  # of a run without masks; None: it has none
+    every: int  # frames between two runs in its schedule
+    boxes_ms: float | None = None  # of a run without masks; None if the network has no masks
 
     def look_ms(self, sparing: int) -> float:
-        """Of a run, the mean of those with masks and of those without."""
+        """Returns the mean time of a run, over runs with and without masks, in ms."""
         if self.boxes_ms is None or sparing == 1:
             return self.ms
         return self.boxes_ms + (self.ms - self.boxes_ms) / MASKS_SPARING
@@ -44,7 +43,7 @@ class Cost:
 def measure(
     runs: Mapping[str, Callable[[NDArray[np.uint8]], object]], camera: Camera, within_s: float
 ) -> dict[str, float]:
-    """Name -> ms that one run takes, the median, on an image of noise of the camera's size."""
+    """Returns the median run time in ms per network name, on a noise image of the camera's size."""
     shape = (camera.height_px, camera.width_px, 3)
     image = np.random.default_rng(0).integers(0, 255, shape, np.uint8)
     out = {}
@@ -60,17 +59,17 @@ def measure(
 
 
 def threads_of_a_network(cores: float) -> int:
-    """The most that one network gets, where the user does not say: a core is left to the frames."""
+    """Returns the default thread count of a network; one core remains for the front end."""
     return max(1, int(cores) - 1)
 
 
 def load(costs: Mapping[str, Cost], period_ms: float, sparing: int) -> float:
-    """Cores that networks keep busy which look `sparing` times less often than their schedules say."""
+    """Returns the load of the networks in cores, if they run `sparing` times less often than scheduled."""
     return sum(cost.look_ms(sparing) * cost.threads / (cost.every * sparing * period_ms) for cost in costs.values())
 
 
 class LookRate:
-    """`sparing`: the networks look on one frame in `every * sparing`. It begins at what the cores at hand carry."""
+    """Controls `sparing`: a network runs on one frame in `every * sparing`. It starts at what the cores sustain."""
 
     def __init__(self, config: LooksConfig, costs: Mapping[str, Cost], cores: float, period_ms: float) -> None:
         self._config, self._period_ms, self._cores = config, period_ms, cores
@@ -82,13 +81,13 @@ class LookRate:
         fits = (n for n in range(1, self.most + 1) if load(costs, period_ms, n) <= room)
         self.sparing = next(fits, self.most)
         self._steps_ms: deque[float] = deque(maxlen=config.window_frames)
-        self._dropped = 0  # frames since the last change before which some were
-        self._calm = 0  # frames in a row
+        self._dropped = 0  # frames that followed dropped ones, since the last change
+        self._calm = 0  # consecutive frames
         self._calm_frames = config.calm_frames
-        self._tried: int | None = None  # frames since they looked more often
+        self._tried: int | None = None  # frames since the rate was increased
 
     def describe(self, costs: Mapping[str, Cost], awaited: Collection[str]) -> str:
-        """One line for the log: what was measured and chosen."""
+        """Returns a log line with the measured run times and the selected rates."""
         parts = [
             f"{name} {cost.look_ms(self.sparing):.0f} ms on {cost.threads} threads, "
             f"every {cost.every * self.sparing} frames, "
@@ -99,16 +98,16 @@ class LookRate:
 
     @property
     def masks_every(self) -> int:
-        """A network that can leave its masks out computes them on every n-th run."""
+        """Number of runs per computation of masks, for networks that can omit them."""
         return 1 if self.sparing == 1 else MASKS_SPARING
 
     def judge(self, step_ms: float, dropped: bool) -> bool:
-        """One frame more, which took perceive `step_ms`; `dropped`: some before it were. Whether `sparing` changed."""
+        """Adds a frame: its processing time, whether frames before it were dropped. Returns if `sparing` changed."""
         config = self._config
         self._steps_ms.append(step_ms)
         self._dropped += dropped
         self._tried = None if self._tried is None else self._tried + 1
-        if len(self._steps_ms) < config.window_frames:  # a change shows first in the frames after it
+        if len(self._steps_ms) < config.window_frames:  # wait until the window covers only frames after the last change
             return False
         mean_ms = statistics.fmean(self._steps_ms)
         if self._dropped or mean_ms > config.busy_share * self._period_ms:

@@ -1,4 +1,4 @@
-"""The entry of processes beside the pipeline, recorder and map: nobody waits for them, and all others go first."""
+"""Entry point of the recorder and map processes, which run at lower priority beside the pipeline."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from birdslam.runtime.configuration import Configuration
 from birdslam.runtime.process.child import begin
 from birdslam.runtime.process.vitals import Vitals
 
-DISK_STATUS = 3  # the disk failed it
+DISK_STATUS = 3  # exit status after a disk error
 
 _Order = TypeVar("_Order", bound=msgspec.Struct)
 

@@ -1,4 +1,4 @@
-"""What every process that the supervisor starts does first."""
+"""Initialization of every process that the supervisor starts."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ def begin(arguments: Sequence[str]) -> tuple[str, Configuration, Vitals]:
 
 
 def end_with_parent(parent_pid: int) -> None:
-    """Where the supervisor is killed, this process gets SIGTERM (PR_SET_PDEATHSIG)."""
+    """Requests SIGTERM for this process when the supervisor dies (PR_SET_PDEATHSIG)."""
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     if os.getppid() != parent_pid:
         raise SystemExit(0)
 
 
 def give_back_memory() -> None:
-    """What was freed while a process was built goes back to the system; glibc would keep it for later."""
+    """Returns memory that was freed during startup to the system; glibc would keep it."""
     ctypes.CDLL(None).malloc_trim(0)

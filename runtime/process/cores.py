@@ -1,4 +1,4 @@
-"""How many cores this process may use."""
+"""Number of cores that this process may use."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ CGROUPS = Path("/sys/fs/cgroup")
 
 
 def usable_cores() -> float:
-    """By its affinity and by the quota of its control groups."""
+    """Returns the number of cores allowed by the CPU affinity and the quota of the control groups."""
     return min(float(len(os.sched_getaffinity(0))), quota(CGROUPS))
 
 
 def quota(root: Path) -> float:
-    """Cores that this process' control groups, in the tree at `root`, leave it; infinite where they set no limit."""
+    """Returns the CPU quota of this process's control groups, in cores; infinite without a limit."""
     group = Path("/proc/self/cgroup").read_text().strip().rpartition("::")[2].lstrip("/")
     limits = [float("inf")]
     for place in (root / group, *(root / group).parents):
@@ -23,5 +23,5 @@ def quota(root: Path) -> float:
             break
         with contextlib.suppress(OSError, ValueError):
             allowed, period = (place / "cpu.max").read_text().split()
-            limits.append(float(allowed) / float(period))  # "max" is no number, and no limit
+            limits.append(float(allowed) / float(period))  # "max" means no limit
     return min(limits)

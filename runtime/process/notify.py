@@ -13,9 +13,9 @@ LOOK_S = 1.0  # how often the status line is written where systemd watches nothi
 
 
 class Notifier:
-    """Speaks to the socket that systemd names in the environment; says nothing where there is none.
+    """Sends to the socket that systemd names in the environment; does nothing without one.
 
-    A message that can't be delivered is lost: systemd then misses the watchdog's, and acts.
+    An undeliverable message is dropped; if it is the watchdog's, systemd acts on its timeout.
     """
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
@@ -28,13 +28,13 @@ class Notifier:
         self._said: set[str] = set()
 
     def once(self, state: str) -> None:
-        """READY=1 or STOPPING=1, the first time."""
+        """Sends READY=1 or STOPPING=1 once."""
         if state not in self._said:
             self._said.add(state)
             self._send(state)
 
     def alive(self, status: str) -> None:
-        """The watchdog's sign of life and the status line, when they are due."""
+        """Sends the watchdog's heartbeat and the status line when they are due."""
         now_s = time.monotonic()
         if self._address and now_s >= self._due_s:
             self._due_s = now_s + min(1.0, self.period_s or 1.0)

@@ -1,4 +1,4 @@
-"""When a node is restarted, and from which frame it resumes."""
+"""Restart policy of a node, and the frame at which it resumes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from birdslam.runtime.process.vitals import Vitals
 
 
 class Resume(msgspec.Struct, frozen=True):
-    """Where a node that died had come to: one more than its last frame, and that frame's times."""
+    """The frame after the last one of a dead node, and the times of that last frame."""
 
     next_frame: int
     t_source_ns: int
@@ -23,10 +23,10 @@ class Resume(msgspec.Struct, frozen=True):
 
 
 class Assignment(msgspec.Struct, frozen=True):
-    """What a prepared process is sent when its work begins."""
+    """The message that starts the work of a prepared process."""
 
     restarts: int = 0  # of this node in this run
-    cause: str = ""  # of the last one
+    cause: str = ""  # of the last restart
     resume: Resume | None = None
 
 
@@ -34,10 +34,7 @@ FIRST = Assignment()
 
 
 class Restarts:
-    """The rule of one node: at once, then after a growing delay, and no more when it keeps failing.
-
-    Raises nothing: `died` says when the next process is due, or that there is none.
-    """
+    """The restart policy of one node: immediately, then with exponential delay, up to a limit within a time window."""
 
     def __init__(self, config: RuntimeConfig) -> None:
         self.count = 0
@@ -47,7 +44,7 @@ class Restarts:
         self._resume: Resume | None = None
 
     def died(self, now_s: float, cause: str, vitals: Vitals) -> float | None:
-        """When the next one is due, on the clock of `now_s`; None where it died too often of late."""
+        """Returns the time of the next start, on the clock of `now_s`; None if the limit of restarts is reached."""
         config = self._config
         while self._recent_s and now_s - self._recent_s[0] > config.restart_window_s:
             self._recent_s.popleft()
@@ -57,21 +54,21 @@ class Restarts:
         self._recent_s.append(now_s)
         self.count += 1
         self.cause = cause
-        if vitals["next_frame"]:  # else it died before its first frame: what the one before it left still holds
+        if vitals["next_frame"]:  # else it died before its first frame: keep the previous resume point
             self._resume = Resume(vitals["next_frame"], vitals["t_source_ns"], vitals["t_capture_ns"])
         delay_ms = config.restart_backoff_ms * 2 ** (before - 1) if before else 0.0
         return now_s + min(delay_ms, config.restart_backoff_max_ms) / 1e3
 
     def assignment(self) -> Assignment:
-        """For the next process."""
+        """Returns the assignment of the next process."""
         return Assignment(self.count, self.cause, self._resume)
 
 
 class EpochFile:
-    """The last epoch that planners may have seen, in a file of the vehicle's runtime directory.
+    """The last published epoch, in a memory-mapped file of the vehicle's runtime directory; -1 if there is none.
 
-    It is mapped: a store takes no time, comes before the estimate that bears the epoch, and outlives a kill -9 of
-    everything, so that epochs never repeat while the computer is up. -1 where there was none.
+    The epoch is stored before the first estimate that has it and survives a kill -9 of all processes, so epochs never
+    repeat until the computer restarts.
     """
 
     def __init__(self, path: Path) -> None:
@@ -84,7 +81,7 @@ class EpochFile:
         self.last = max(-1, int(self._next[0]) - 1)
 
     def store(self, epoch: int) -> None:
-        """Notes an epoch, before it is sent; a smaller one is no news."""
+        """Stores an epoch before it is published; ignores smaller ones."""
         if epoch > self.last:
             self.last = epoch
             self._next[0] = epoch + 1

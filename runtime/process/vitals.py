@@ -1,7 +1,7 @@
 """A node's heartbeat and counters, in memory that it shares with the supervisor.
 
-The memory is an anonymous file whose descriptor the supervisor hands down: it has no name to clean up, and what a
-killed node counted can still be read. Each counter has one writer; an aligned 8-byte store is never read half written.
+The memory is an anonymous file whose descriptor the child inherits: it needs no cleanup, and the counters of a killed
+node remain readable. Each counter has one writer; an aligned 8-byte store is atomic.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Vitals:
     """
 
     def __init__(self, fd: int | None = None) -> None:
-        """Maps what the supervisor handed down; without `fd`, makes new memory."""
+        """Maps the inherited descriptor; creates new memory if `fd` is None."""
         size = 8 * len(COUNTERS)
         self.fd = os.memfd_create("birdslam-vitals") if fd is None else fd
         if fd is None:
@@ -36,7 +36,7 @@ class Vitals:
         self._counters = np.frombuffer(mmap.mmap(self.fd, size), dtype=np.int64)
 
     def beat(self) -> None:
-        """The loop is alive."""
+        """Records the time of the heartbeat."""
         self._counters[0] = time.monotonic_ns()
 
     def count(self, **counters: int) -> None:
