@@ -222,7 +222,7 @@ def test_several_topics_are_listed_and_one_is_named(tmp_path: Path) -> None:
 def test_a_camera_without_a_known_place_needs_a_file(tmp_path: Path) -> None:
     messages = [message for message in drive() if message[0] != "/tf_static"]
     path = ros.write_bag(tmp_path / "drive", messages)
-    with pytest.raises(DatasetError, match=r"height of the camera above the road.*birdslam calibrate rosbag:.*--height M"):
+    with pytest.raises(DatasetError, match=r"height of the camera above.*birdslam calibrate rosbag:.*--height M"):
         open_recording(f"rosbag:{path}")
     assert open_recording(f"rosbag:{path}", CAMERA).camera is CAMERA
     own = RosbagRecording.own_lens(path, BagTopics())
