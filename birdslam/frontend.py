@@ -22,9 +22,10 @@ from birdslam.odometry.external import ExternalConfig
 from birdslam.odometry.odometry import Motion, Odometry, OdometryConfig
 from birdslam.odometry.plausibility import PlausibilityConfig, PlausibilityGate
 from birdslam.people.people_records import followed_people
-from birdslam.people.people_tracker import FIRST_PERSON, PeopleTracker, PeopleTrackingConfig
+from birdslam.people.people_tracker import PeopleTracker, PeopleTrackingConfig
 from birdslam.perception import Perception
 from birdslam.types import (
+    FIRST_PERSON,
     NS_PER_S,
     EgoEdge,
     Frame,
