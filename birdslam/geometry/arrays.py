@@ -1,4 +1,4 @@
-"""What arrays hold, as annotations name it; their shapes stand in docstrings."""
+"""Array types for annotations; docstrings state the shapes."""
 
 from __future__ import annotations
 

@@ -16,22 +16,22 @@ from birdslam.geometry.arrays import Floats
 # Camera axes (x right, y down, z forward) to REP-103 axes (x forward, y left, z up).
 AXES_EGO_CAM = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
-# Where the ground under the camera is measured: the middle of the road that odometry looks at. The height of a road of
-# vertical curvature v over that plane is v x (x - PLANE_AT_M) / 2, x ahead: so pitch and curvature hardly mix
+# Distance at which the ground plane under the camera intersects the road: the middle of the strip that odometry aligns.
+# A road of vertical curvature v is v x (x - PLANE_AT_M) / 2 above that plane, which decorrelates pitch and curvature
 PLANE_AT_M = 11.0
 
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 
 
 class VerticalCurvature(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Of the road ahead, with its 1-sigma, 1/m; > 0: it rises over the plane under the camera (`PLANE_AT_M`)."""
+    """Vertical curvature of the road ahead and its 1-sigma, 1/m; > 0: the road rises over the ground plane."""
 
     per_m: float
     sigma_per_m: Positive
 
 
 class GroundPlane(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The road under the camera: `height_m` above it, nose down by `pitch_rad`, right side down by `roll_rad`."""
+    """Pose of the camera over the road: height, pitch (> 0: nose down) and roll (> 0: right side down)."""
 
     height_m: Positive
     pitch_rad: float = 0.0
@@ -39,16 +39,16 @@ class GroundPlane(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def R_ego_cam(self) -> Floats:
-        """(3, 3): turns vectors of the camera into ego; read-only."""
+        """(3, 3) rotation from camera axes to ego axes; read-only."""
         return _rotation(self.pitch_rad, self.roll_rad)
 
     @property
     def normal_cam(self) -> Floats:
-        """(3,): the road's unit normal in camera axes, up; [0, -1, 0] on level ground as in Eq. 1."""
+        """(3,) upward unit normal of the road in camera axes; [0, -1, 0] on level ground as in Eq. 1."""
         return self.R_ego_cam[2]
 
 
-@lru_cache(maxsize=64)  # a frame uses the same few rotations tens of times
+@lru_cache(maxsize=64)  # each frame uses the same few rotations many times
 def _rotation(pitch_rad: float, roll_rad: float) -> Floats:
     cp, sp = math.cos(pitch_rad), math.sin(pitch_rad)
     cr, sr = math.cos(roll_rad), math.sin(roll_rad)
@@ -60,7 +60,7 @@ def _rotation(pitch_rad: float, roll_rad: float) -> Floats:
 
 
 def plane_normal(pitch_rad: float, roll_rad: float) -> tuple[Floats, Floats, Floats]:
-    """The road's upward unit normal in camera axes and its derivatives by pitch and by roll, (3,) each."""
+    """Upward unit normal of the road in camera axes, and its derivatives by pitch and by roll, (3,) each."""
     cp, sp, cr, sr = np.cos(pitch_rad), np.sin(pitch_rad), np.cos(roll_rad), np.sin(roll_rad)
     return (
         np.array([-cp * sr, -cp * cr, -sp]),
@@ -77,10 +77,9 @@ def plane_tilt(normal: Floats) -> tuple[float, float]:
 class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A pinhole camera over a road, as a camera file (TOML) states it.
 
-    `distortion` holds OpenCV's coefficients (k1, k2, p1, p2[, k3[, k4, k5, k6]]), empty for an undistorted image; of a
-    `fisheye` lens those of its equidistant model (k1, k2, k3, k4; Kannala and Brandt 2006), as ROS and OpenCV have it.
-    `tilt_sigma_rad` is 1-sigma of pitch and roll; by default that of a bracket mounted by hand.
-    Raises ValueError (on decoding: msgspec.ValidationError) where the numbers can't be a camera's.
+    `distortion` holds OpenCV's coefficients (k1, k2, p1, p2[, k3[, k4, k5, k6]]), empty for an undistorted image. A
+    `fisheye` lens has those of the equidistant model (k1, k2, k3, k4; Kannala and Brandt 2006), as in ROS and OpenCV.
+    Raises ValueError (on decoding: msgspec.ValidationError) for values outside the range of cameras.
     """
 
     width_px: Annotated[int, msgspec.Meta(ge=16, le=16384)]  # of the image
@@ -90,14 +89,16 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     cx_px: float  # principal point
     cy_px: float  # principal point
     height_m: Positive  # over the road: the metric scale
-    pitch_rad: float = 0.0  # of the camera against the road; > 0: nose down
+    pitch_rad: float = 0.0  # against the road; > 0: nose down
     roll_rad: float = 0.0  # > 0: right side down
-    # OpenCV's coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]]; none: undistorted images
+    # OpenCV's coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]]; empty: undistorted images
     distortion: tuple[float, ...] = ()
-    tilt_sigma_rad: Positive = 0.015  # 1-sigma of pitch and roll; by default of a bracket mounted by hand
+    tilt_sigma_rad: Positive = 0.015  # 1-sigma of pitch and roll; the default is for a bracket mounted by hand
     fisheye: bool = False  # `distortion` is k1, k2, k3, k4 of the equidistant model
-    readout_s: Annotated[float, msgspec.Meta(ge=0.0, le=0.1)] = 0.0  # from the first row to the last; 0: all at once
-    # 1-sigma of all lengths as a fraction, where height or focal length are estimates; 0: they were measured
+    readout_s: Annotated[float, msgspec.Meta(ge=0.0, le=0.1)] = (
+        0.0  # readout time from the first row to the last; 0: global shutter
+    )
+    # 1-sigma of the scale as a fraction if height or focal length are estimated; 0: they were measured
     scale_sigma_rel: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.0
 
     def __post_init__(self) -> None:
@@ -117,13 +118,15 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 f"camera: focal lengths {self.fx_px}, {self.fy_px} px do not fit a {self.width_px} px image"
             )
         if not 0.2 < self.height_m < 5.0:
-            raise ValueError(f"camera: height_m = {self.height_m} is no height of a camera over the road (0.2 to 5 m)")
+            raise ValueError(
+                f"camera: height_m = {self.height_m} is not plausible; measure the height over the road (0.2 to 5 m)"
+            )
         if abs(self.pitch_rad) > 0.5 or abs(self.roll_rad) > 0.5:
             raise ValueError("camera: pitch_rad and roll_rad must lie within 0.5 rad")
         if len(self.distortion) not in (0, 4, 5, 8):
             raise ValueError(f"camera: distortion needs 0, 4, 5 or 8 coefficients, got {len(self.distortion)}")
         if self.fisheye and len(self.distortion) != 4:
-            raise ValueError(f"camera: a fisheye's distortion needs 4 coefficients, got {len(self.distortion)}")
+            raise ValueError(f"camera: a fisheye needs 4 distortion coefficients, got {len(self.distortion)}")
 
     @property
     def K(self) -> Floats:
@@ -131,14 +134,14 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return np.array([[self.fx_px, 0.0, self.cx_px], [0.0, self.fy_px, self.cy_px], [0.0, 0.0, 1.0]])
 
     def to_xy(self, px: Floats) -> Floats:
-        """(N, 2) rays of z = 1 from pixels (N, 2)."""
+        """(N, 2) normalised coordinates of pixels (N, 2)."""
         out = np.empty(px.shape)
         out[:, 0] = (px[:, 0] - self.cx_px) / self.fx_px
         out[:, 1] = (px[:, 1] - self.cy_px) / self.fy_px
         return out
 
     def to_px(self, xy: Floats) -> Floats:
-        """(N, 2) pixels of rays (N, 2) of z = 1."""
+        """(N, 2) pixels of normalised coordinates (N, 2)."""
         out = np.empty(xy.shape)
         out[:, 0] = xy[:, 0] * self.fx_px + self.cx_px
         out[:, 1] = xy[:, 1] * self.fy_px + self.cy_px
@@ -146,7 +149,7 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def ground(self) -> GroundPlane:
-        """The calibrated ground plane: what the online estimate starts from."""
+        """The calibrated ground plane, from which the online estimate starts."""
         return GroundPlane(self.height_m, self.pitch_rad, self.roll_rad)
 
 
@@ -168,7 +171,7 @@ class Undistorter:
             )
 
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The undistorted image, with the same K. Raises ValueError where the size is not the camera's."""
+        """Undistorts an image; K stays the same. Raises ValueError for an image of another size."""
         height_px, width_px = image.shape[:2]
         if (width_px, height_px) != (self.camera.width_px, self.camera.height_px):
             raise ValueError(

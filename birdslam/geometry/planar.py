@@ -7,11 +7,11 @@ import numpy as np
 from birdslam.geometry.arrays import Floats
 
 _TAU = 2.0 * np.pi
-_SMALL_RAD = 0.05  # below it the series are exact to the last digit
+_SMALL_RAD = 0.05  # below this the series are exact in double precision
 
 
 def compose(a: Floats, b: Floats) -> Floats:
-    """(..., 3) poses: T_a_b of each row of `a`, applied to the poses of `b`; yaw is not wrapped."""
+    """(..., 3) T_a_c = T_a_b @ T_b_c, rows `a` = T_a_b and `b` = T_b_c; yaw is not wrapped."""
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
     bx, by = b[..., 0], b[..., 1]
     out = a + b
@@ -21,7 +21,7 @@ def compose(a: Floats, b: Floats) -> Floats:
 
 
 def between(a: Floats, b: Floats) -> Floats:
-    """(..., 3): the inverse of `a` composed with `b`; yaw in [-pi, pi)."""
+    """(..., 3) inverse of `a` composed with `b`; yaw in [-pi, pi)."""
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
     out = b - a
     dx, dy = out[..., 0].copy(), out[..., 1].copy()

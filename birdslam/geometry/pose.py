@@ -1,4 +1,4 @@
-"""Rigid motions in space for the image odometry: rotation matrices, rotation vectors, `Pose`."""
+"""Rigid motions in space, SE(3): rotation matrices, rotation vectors, `Pose`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from birdslam.geometry.arrays import Floats
 
 
 def rotation_exp(w: Floats) -> Floats:
-    """(3, 3) rotation by the vector w (3,) in radians (Rodrigues)."""
+    """(3, 3) rotation matrix of the rotation vector w (3,) in radians (Rodrigues)."""
     x, y, z = w.tolist()
     angle = math.sqrt(x * x + y * y + z * z)
     # I + a S + b S^2 with S = skew(w), S^2 = w w^T - angle^2 I
@@ -27,7 +27,7 @@ def rotation_exp(w: Floats) -> Floats:
 
 
 def rotation_log(R: Floats) -> Floats:
-    """(3,) rotation vector in radians of a rotation of less than half a turn."""
+    """(3,) rotation vector in radians of a rotation by less than pi."""
     axis = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
     sine = float(np.sqrt(axis @ axis))
     angle = float(np.arctan2(sine, 0.5 * (np.trace(R) - 1.0)))
@@ -35,9 +35,9 @@ def rotation_log(R: Floats) -> Floats:
 
 
 def orthonormal(R: Floats) -> Floats:
-    """The nearest rotations to (..., 3, 3) that are nearly orthonormal.
+    """Projects nearly orthonormal matrices (..., 3, 3) to the nearest rotations.
 
-    One Newton step for the polar factor, with quadratic convergence.
+    One Newton step for the polar factor; convergence is quadratic.
     """
     out: Floats = 1.5 * R - 0.5 * R @ np.swapaxes(R, -1, -2) @ R
     return out
@@ -45,7 +45,7 @@ def orthonormal(R: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Pose:
-    """T_w_c: takes camera points to the window's frame, p_w = R p_c + p."""
+    """T_w_c: transforms camera points to the window frame, p_w = R p_c + p."""
 
     R: Floats  # (3, 3)
     p: Floats  # (3,)
@@ -61,5 +61,5 @@ class Pose:
         return Pose(self.R.T @ other.R, self.R.T @ (other.p - self.p))
 
     def moved(self, step: Floats) -> Pose:
-        """By a step (6,) = (translation, rotation vector) in the camera's own axes."""
+        """The pose after a step (6,) = (translation, rotation vector) in the camera's axes."""
         return Pose(self.R @ rotation_exp(step[3:]), self.p + self.R @ step[:3])

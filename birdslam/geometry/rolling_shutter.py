@@ -1,8 +1,7 @@
-"""Rows that are read one after the other: when each pixel of an image was read, and where its point was at one time.
+"""Rolling shutter: the readout time of each pixel, and the correction of its position to the image time.
 
-An image is said to be of the time when its middle row was read. A point that is read later or earlier has moved in the
-meantime: its place then and its place at the image's time differ by the camera's own motion (Hedborg et al., "Rolling
-shutter bundle adjustment", CVPR 2012), which is constant while one image is read.
+The image time is the readout time of the middle row. The camera velocity is assumed constant during one readout
+(Hedborg et al., "Rolling shutter bundle adjustment", CVPR 2012).
 """
 
 from __future__ import annotations
@@ -13,24 +12,24 @@ import numpy as np
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 
-_CELL_PX = 8  # of the table of rows: a lens bends a row by far less within it
-_MIN_DISTANCE = 0.05  # of a depth that a motion while an image is read would leave, as a share of it
-_ROUNDS = 2  # by which the row is found that a point is read in
-Rate = tuple[Floats, Floats]  # (3,) a second and (3,) rad/s of the camera, in its own axes
+_CELL_PX = 8  # of the lookup table of rows
+_MIN_DEPTH_RATIO = 0.05  # depth after the motion during the readout over the depth before
+_FIXED_POINT_ITERATIONS = 2  # for the row in which a moving point is read
+Rate = tuple[Floats, Floats]  # camera velocity (3,) per second and angular velocity (3,) rad/s, in camera axes
 
 
 class RollingShutter:
-    """Of one camera, whose images are undistorted: what was a row of the sensor is a bent line there."""
+    """Rolling-shutter correction for undistorted images, in which a sensor row is a curve."""
 
     def __init__(self, camera: Camera) -> None:
         self.readout_s = camera.readout_s
         self._camera = camera
         self._rows: Floats | None = None
         if camera.readout_s and camera.distortion:
-            self._rows = _rows_of_sensor(camera)
+            self._rows = _sensor_row_table(camera)
 
     def row(self, u: Floats, v: Floats) -> Floats:
-        """Which row of the sensor pixels (u, v) of the undistorted image were read in: -0.5 the first, 0.5 the last."""
+        """(N,) sensor row of undistorted pixels (u, v), from -0.5 (first) to 0.5 (last)."""
         if self._rows is None:
             out: Floats = (v + 0.5) / self._camera.height_px - 0.5
             return out
@@ -39,33 +38,33 @@ class RollingShutter:
         return self._rows[at, np.clip(u * (1.0 / _CELL_PX) + 0.5, 0, columns - 1).astype(np.int64)]
 
     def at_middle(self, xy: Floats, inverse_depth: Floats, rate: Rate) -> Floats:
-        """(N, 2) where points seen at `xy` (N, 2) were when the middle row was read; the camera moves at `rate`.
+        """Corrects observations `xy` (N, 2) to the readout time of the middle row, for a camera that moves at `rate`.
 
-        `inverse_depth` (N,) is theirs as seen, in the rate's scale.
+        `inverse_depth` (N,) is at the observation, in the scale of the rate.
         """
         late_s = self.readout_s * self.row(*self._camera.to_px(xy).T)
-        return _moved(xy, inverse_depth, rate, late_s)
+        return _project_before(xy, inverse_depth, rate, late_s)
 
     def as_read(self, xy: Floats, inverse_depth: Floats, rate: Rate) -> Floats:
-        """(N, 2) where points are read that were at `xy` (N, 2) when the middle row was; the inverse of `at_middle`."""
+        """(N, 2) observations of points that are at `xy` (N, 2) at the image time; the inverse of `at_middle`."""
         out = xy
-        for _ in range(_ROUNDS):
+        for _ in range(_FIXED_POINT_ITERATIONS):
             late_s = self.readout_s * self.row(*self._camera.to_px(out).T)
-            out = _moved(xy, inverse_depth, rate, -late_s)
+            out = _project_before(xy, inverse_depth, rate, -late_s)
         return out
 
 
-def _moved(xy: Floats, inverse_depth: Floats, rate: Rate, for_s: Floats) -> Floats:
-    """(N, 2) of points as a camera sees them that stands where it was `for_s` (N,) before."""
+def _project_before(xy: Floats, inverse_depth: Floats, rate: Rate, for_s: Floats) -> Floats:
+    """(N, 2) projections of points into the camera as it was `for_s` (N,) before."""
     rays = np.column_stack([xy, np.ones(len(xy))])
     shift, turn = rate
     q = rays + for_s[:, None] * (inverse_depth[:, None] * shift + np.cross(turn, rays))
-    out: Floats = q[:, :2] / np.maximum(q[:, 2:], _MIN_DISTANCE)
+    out: Floats = q[:, :2] / np.maximum(q[:, 2:], _MIN_DEPTH_RATIO)
     return out
 
 
-def _rows_of_sensor(camera: Camera) -> Floats:
-    """`RollingShutter.row` at every eighth pixel of the undistorted image."""
+def _sensor_row_table(camera: Camera) -> Floats:
+    """Table of `RollingShutter.row` on a grid of _CELL_PX over the undistorted image."""
     v, u = np.mgrid[: camera.height_px + _CELL_PX : _CELL_PX, : camera.width_px + _CELL_PX : _CELL_PX]
     xy = camera.to_xy(np.column_stack([u.ravel(), v.ravel()]).astype(np.float64))
     lens = np.array(camera.distortion)

@@ -14,18 +14,18 @@ import numpy as np
 
 from birdslam.geometry.arrays import Floats
 
-_SMALL_ANGLE_RAD = 1e-9  # below it the first order is exact in double precision
+_SMALL_ANGLE_RAD = 1e-9  # below this the first order is exact in double precision
 
 
 def wrap(angle_rad: float) -> float:
-    """The same angle in [-pi, pi)."""
+    """Wraps an angle to [-pi, pi)."""
     return (angle_rad + math.pi) % (2.0 * math.pi) - math.pi
 
 
 class SE2(msgspec.Struct, frozen=True, array_like=True, gc=False):
-    """A pose or motion on the road plane; on the wire `[x_m, y_m, yaw_rad]`.
+    """A pose or motion on the road plane; serialized as `[x_m, y_m, yaw_rad]`.
 
-    Raises ValueError (on decoding: msgspec.ValidationError) where a number is not finite.
+    Raises ValueError (on decoding: msgspec.ValidationError) for a number that is not finite.
     """
 
     x_m: float = 0.0
@@ -62,7 +62,7 @@ class SE2(msgspec.Struct, frozen=True, array_like=True, gc=False):
         return SE2(-c * self.x_m - s * self.y_m, s * self.x_m - c * self.y_m, wrap(-self.yaw_rad))
 
     def scaled(self, factor: float) -> SE2:
-        """The same in another scale: `factor` of the new unit is one of the old."""
+        """The pose with its translation multiplied by `factor`."""
         return SE2(factor * self.x_m, factor * self.y_m, self.yaw_rad)
 
     def between(self, other: SE2) -> SE2:
@@ -71,7 +71,7 @@ class SE2(msgspec.Struct, frozen=True, array_like=True, gc=False):
 
     @staticmethod
     def exp(xi: Floats) -> SE2:
-        """The motion of the constant twist `xi` = (x_m, y_m, yaw_rad) over one unit of time."""
+        """The motion by the constant twist `xi` = (x_m, y_m, yaw_rad) over unit time."""
         vx, vy, w = (float(v) for v in xi)
         if abs(w) < _SMALL_ANGLE_RAD:
             a, b = 1.0, w / 2.0
@@ -87,12 +87,12 @@ class SE2(msgspec.Struct, frozen=True, array_like=True, gc=False):
         return np.array([a * self.x_m + half * self.y_m, -half * self.x_m + a * self.y_m, w])
 
     def adjoint(self) -> Floats:
-        """(3, 3): moves a twist of frame b to frame a, `T @ exp(xi) == exp(Ad xi) @ T`."""
+        """(3, 3) adjoint: transforms a twist of frame b to frame a, `T @ exp(xi) == exp(Ad xi) @ T`."""
         c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
         return np.array([[c, -s, self.y_m], [s, c, -self.x_m], [0.0, 0.0, 1.0]])
 
     def rotation(self) -> Floats:
-        """(2, 2) rotation part of `T_a_b`: turns vectors of b into a."""
+        """(2, 2) rotation part of `T_a_b`, from b to a."""
         c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
         return np.array([[c, -s], [s, c]])
 
