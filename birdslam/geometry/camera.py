@@ -95,9 +95,7 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     distortion: tuple[float, ...] = ()
     tilt_sigma_rad: Positive = 0.015  # 1-sigma of pitch and roll; the default is for a bracket mounted by hand
     fisheye: bool = False  # `distortion` is k1, k2, k3, k4 of the equidistant model
-    readout_s: Annotated[float, msgspec.Meta(ge=0.0, le=0.1)] = (
-        0.0  # readout time from the first row to the last; 0: global shutter
-    )
+    readout_s: Annotated[float, msgspec.Meta(ge=0.0, le=0.1)] = 0.0  # from the first row to the last; 0: global shutter
     # 1-sigma of the scale as a fraction if height or focal length are estimated; 0: they were measured
     scale_sigma_rel: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.0
 
@@ -118,9 +116,7 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 f"camera: focal lengths {self.fx_px}, {self.fy_px} px do not fit a {self.width_px} px image"
             )
         if not 0.2 < self.height_m < 5.0:
-            raise ValueError(
-                f"camera: height_m = {self.height_m} is not plausible; measure the height over the road (0.2 to 5 m)"
-            )
+            raise ValueError(f"camera: height_m = {self.height_m} is outside 0.2 to 5 m; measure it over the road")
         if abs(self.pitch_rad) > 0.5 or abs(self.roll_rad) > 0.5:
             raise ValueError("camera: pitch_rad and roll_rad must lie within 0.5 rad")
         if len(self.distortion) not in (0, 4, 5, 8):

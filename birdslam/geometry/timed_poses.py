@@ -29,10 +29,7 @@ class TimedPoses:
         begin, end = int(self.t_ns[after - 1]), int(self.t_ns[after])
         if end - begin > max_gap_ns:
             return None
-        from scipy.spatial.transform import (
-            Rotation,
-            Slerp,
-        )  # lazy import: few processes that import geometry need scipy
+        from scipy.spatial.transform import Rotation, Slerp  # lazy: few processes that import geometry need scipy
 
         fraction = (t_ns - begin) / (end - begin)
         earlier, later = self.poses[after - 1], self.poses[after]
