@@ -194,7 +194,7 @@ def test_a_distorted_image_comes_straight(fisheye: bool) -> None:
 
 
 def test_a_fisheye_needs_its_four_coefficients() -> None:
-    with pytest.raises(ValueError, match="fisheye's distortion needs 4"):
+    with pytest.raises(ValueError, match="fisheye needs 4 distortion"):
         Camera(640, 480, 300.0, 305.0, 322.0, 238.0, 1.5, fisheye=True)
 
 
