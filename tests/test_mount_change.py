@@ -37,7 +37,7 @@ def detect(
     for k, tilt in enumerate(tilts):
         shift = np.zeros(2) if off is None else off[k]
         detector.update(np.array([camera.pitch_rad, camera.roll_rad]) + tilt + shift, STEP_M, True)
-        out.append(detector.drifted)
+        out.append(detector.has_drifted)
     return detector, np.array(out)
 
 
@@ -110,4 +110,4 @@ def test_a_tilt_that_was_not_measured_says_nothing() -> None:
     for _ in range(200):
         detector.update(np.array([0.2, 0.2]), STEP_M, False)
     np.testing.assert_array_equal(detector.mount, before)
-    assert not detector.drifted
+    assert not detector.has_drifted

@@ -76,7 +76,7 @@ def test_what_stands_is_told_by_the_streets_own_motion_where_no_length_is_known(
 def test_a_stretch_begins_anew_where_most_corners_were_lost() -> None:
     fixed_corners, px = FixedCorners(CAMERA, FixedCornersConfig()), np.full((20, 2), [300.0, 165.0])
     px[:, 0] += np.arange(20)
-    fixed_corners.begin(np.arange(20), px)
+    fixed_corners.start(np.arange(20), px)
     for first_id in (20, 40):
         assert not fixed_corners.update(first_id + np.arange(20), px, GROUND, None).any()
     moved = px + [[0.0, 20.0]] * (np.arange(20) < 8)[:, None]

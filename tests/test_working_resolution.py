@@ -11,9 +11,9 @@ from birdslam.geometry.camera import Camera
 from birdslam.odometry.odometry import Odometry
 from birdslam.odometry.working_resolution import (
     FOCAL_PX,
-    LARGEST_FOCAL_PX,
+    MAX_FOCAL_PX,
     MIN_FOCAL_PX,
-    SMALLEST_FOCAL_PX,
+    MIN_UPSCALED_FOCAL_PX,
     WorkingResolution,
 )
 
@@ -22,7 +22,7 @@ def camera(focal_px: float, width_px: int = 1920, height_px: int = 1080) -> Came
     return Camera(width_px, height_px, focal_px, focal_px, 0.5 * (width_px - 1), 0.52 * height_px, height_m=1.3)
 
 
-@pytest.mark.parametrize("focal_px", [LARGEST_FOCAL_PX, SMALLEST_FOCAL_PX, MIN_FOCAL_PX - 1.0])
+@pytest.mark.parametrize("focal_px", [MAX_FOCAL_PX, MIN_FOCAL_PX, MIN_UPSCALED_FOCAL_PX - 1.0])
 def test_a_film_that_suits_it_stays_as_it_is(focal_px: float) -> None:
     given_camera = camera(focal_px)
     resolution = WorkingResolution(given_camera)
@@ -33,7 +33,7 @@ def test_a_film_that_suits_it_stays_as_it_is(focal_px: float) -> None:
 
 
 @given(
-    st.one_of(st.floats(LARGEST_FOCAL_PX + 1.0, 4000.0), st.floats(MIN_FOCAL_PX, SMALLEST_FOCAL_PX - 1.0)),
+    st.one_of(st.floats(MAX_FOCAL_PX + 1.0, 4000.0), st.floats(MIN_UPSCALED_FOCAL_PX, MIN_FOCAL_PX - 1.0)),
     st.floats(100.0, 1800.0),
     st.floats(100.0, 1000.0),
 )
@@ -43,7 +43,7 @@ def test_a_pixel_is_the_same_ray_at_both_resolutions(focal_px: float, u: float, 
     box = np.array([[u, v, u, v]])
     there = resolution.boxes_px(box)[:, :2]
     np.testing.assert_allclose(resolution.camera.to_xy(there), given_camera.to_xy(box[:, :2]), atol=1e-9)
-    np.testing.assert_allclose(resolution.given_px(there), box[:, :2], atol=1e-9)
+    np.testing.assert_allclose(resolution.original_px(there), box[:, :2], atol=1e-9)
     assert 0.5 * (resolution.camera.fx_px + resolution.camera.fy_px) == pytest.approx(FOCAL_PX, rel=0.01)
 
 
@@ -54,7 +54,7 @@ def test_an_image_keeps_where_its_parts_are() -> None:
     small = resolution.image(image)
     assert small.shape == (resolution.camera.height_px, resolution.camera.width_px) == (540, 960)
     v, u = (float(at.mean()) for at in np.nonzero(small > 100))
-    np.testing.assert_allclose(resolution.given_px(np.array([[u, v]])), [[819.5, 419.5]], atol=1.0)
+    np.testing.assert_allclose(resolution.original_px(np.array([[u, v]])), [[819.5, 419.5]], atol=1.0)
     mask = resolution.mask(image > 0)
     assert mask is not None
     assert mask.sum() == 400

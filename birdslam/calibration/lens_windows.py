@@ -60,7 +60,7 @@ def followed_corners(images: Iterable[tuple[NDArray[np.uint8], Floats, float]], 
         tracks = tracker.track(resolution.image(image))
         tracker.accept(tracks)
         static = outside(tracks.px, resolution.boxes_px(boxes_px))
-        out.append(CornersOfImage(tracks.ids[static], resolution.given_px(tracks.px[static]), t_s))
+        out.append(CornersOfImage(tracks.ids[static], resolution.original_px(tracks.px[static]), t_s))
     return out
 
 

@@ -1,4 +1,4 @@
-"""Dead reckoning: motions chained to the ego's pose on the road plane, its height and its tilt."""
+"""Dead reckoning: composes motions to the ego's pose on the road plane, its height and its tilt."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from birdslam.types import Attitude, EgoEdge
 
 
 class DeadReckoning:
-    """The ego's pose in the frame of its first motion, in which tracks, lanes and attitude are kept.
+    """The ego's pose in the frame of its first motion, the local world frame of tracks, lanes and attitude.
 
-    State: `T_world_ego` (m, rad) and `attitude` (m, rad), both of frame `frame`. Input: each `Motion`. A motion starts
-    at the frame that it names, which need not be the newest: the next measured motion replaces a coasted one. The tilt
-    decays over `memory_m` metres of travel, since roads are level on average.
+    State: `T_world_ego` (m, rad) and `attitude` (m, rad) at frame `frame`. Input: each `Motion`. A motion starts at its
+    `from_frame`, which need not be the newest frame: the next measured motion replaces a coasted one. The tilt decays
+    over `memory_m` metres of travel, since roads are level on average.
     """
 
     def __init__(self, camera: Camera, memory_m: float) -> None:
@@ -29,20 +29,19 @@ class DeadReckoning:
         self._memory_m = memory_m
         self.T_world_ego = SE2()
         self.attitude = Attitude()
-        self._from = (-1, self.T_world_ego, self.attitude)  # the frame that the last motion started from
+        self._from = (-1, self.T_world_ego, self.attitude)  # the start of the last motion
         self._to = self._from
 
     @property
     def frame(self) -> int:
-        """The frame that `T_world_ego` is of; -1 before the first motion."""
+        """Frame of `T_world_ego`; -1 before the first motion."""
         return self._to[0]
 
     def advance(self, motion: Motion) -> EgoEdge:
-        """Moves to `motion.to_frame` and returns the CC edge from the frame before.
+        """Moves to `motion.to_frame` and returns the CC edge from the previous frame.
 
-        The motion starts at the pose of `motion.from_frame`, the last motion's start or end. The edge starts at the
-        last frame, also if that was coasted: without images the edges are a chain, none of which reaches back to a
-        frame that the graph has marginalised.
+        The motion starts at `motion.from_frame`, the start or the end of the last motion. The edge starts at the last
+        frame even if that was coasted, so that no edge refers to a frame that the graph has marginalized.
         """
         last_frame, T_world_last = self.frame, self.T_world_ego
         self._chain(motion)
@@ -75,7 +74,7 @@ class DeadReckoning:
 
 
 def _tilt(attitude: Attitude) -> NDArray[np.float64]:
-    """(3, 3) Ry(pitch) Rx(roll): ego to a frame of the same yaw that is level."""
+    """(3, 3) rotation from ego to a level frame of the same yaw, Ry(pitch) Rx(roll)."""
     level = GroundPlane(1.0, attitude.pitch_rad, attitude.roll_rad).R_ego_cam
     out: NDArray[np.float64] = level @ GroundPlane(1.0).R_ego_cam.T
     return out

@@ -1,9 +1,7 @@
-"""External odometry in place of our own: a trajectory of any visual odometry, or of the car.
+"""External odometry: motions from a metric trajectory of the camera, or of the ego on the road.
 
-The poses are metric, of the camera or of the ego on the road; a frame's motion is that between its pose and the last
-frame's that had one, interpolated between poses that are near enough in time. A frame without a pose is predicted at
-constant velocity, as uncertain as accelerations make it, with the status odometry_coasting. The ground is the
-calibrated plane, and no corners are tracked: there are CP edges of lanes only.
+Poses are interpolated at the frame times. A frame without a pose is predicted at constant velocity and has the status
+odometry_coasting. The ground is the calibrated plane. No corners are tracked, so that only lanes have CP edges.
 """
 
 from __future__ import annotations
@@ -30,21 +28,21 @@ _MIN_S = 1e-6
 
 
 class ExternalConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The uncertainty of a trajectory that states none; by judgement."""
+    """The uncertainty of a trajectory that states none."""
 
-    ego: bool = False  # the poses are of the ego on the road, x forward (as ours); False: of the camera, z forward
-    sigma_scale_rel: NotNegative = 0.02  # 1-sigma of its metres: of each metre that it goes, along the way
-    sigma_direction_rad: NotNegative = 0.005  # of the direction of travel: of each metre, across
-    sigma_yaw_rad: Positive = 0.0005  # of a turn between two frames
-    sigma_turn_rel: NotNegative = 0.01  # and of the turn, as a fraction
-    sigma_floor_m: Positive = 0.002  # of a motion, at the least
-    longest_gap_s: Positive = 0.25  # between two poses that are interpolated
-    longest_coast_s: Positive = 2.0  # without a pose; after that the world restarts
-    sigma_pitch_rad: Positive = 0.006  # of the road against the calibrated plane
+    ego: bool = False  # poses are of the ego on the road, x forward; False: of the camera, z forward
+    sigma_scale_rel: NotNegative = 0.02  # 1-sigma of the scale: of the distance travelled, along the motion
+    sigma_direction_rad: NotNegative = 0.005  # 1-sigma of the direction of travel
+    sigma_yaw_rad: Positive = 0.0005  # 1-sigma of a turn between two frames
+    sigma_turn_rel: NotNegative = 0.01  # 1-sigma proportional to the turn
+    sigma_floor_m: Positive = 0.002  # minimum 1-sigma of a motion
+    longest_gap_s: Positive = 0.25  # maximum gap between two interpolated poses
+    longest_coast_s: Positive = 2.0  # maximum time without a pose; then the world restarts
+    sigma_pitch_rad: Positive = 0.006  # 1-sigma of the road against the calibrated plane
 
 
 class WithoutImages:
-    """What is the same of every EgoMotion that sees no image."""
+    """Base of an EgoMotion that uses no images."""
 
     bonnet_px: Floats | None = None
 
@@ -54,20 +52,20 @@ class WithoutImages:
         return np.zeros(0, np.int64), np.zeros((0, 2))
 
     def track(self, image: NDArray[np.uint8]) -> None:
-        """Does nothing: no image is needed."""
+        """Does nothing."""
 
 
 class ExternalOdometry(WithoutImages):
-    """An EgoMotion of the front end. `trajectory` is of the camera, or with `config.ego` of the ego."""
+    """An EgoMotion of the front end from `trajectory`, of the camera or, with `config.ego`, of the ego."""
 
     def __init__(self, camera: Camera, trajectory: TimedPoses, config: ExternalConfig) -> None:
         self.camera = camera
         self.config = config
         self._trajectory = trajectory
-        self._longest_gap_ns = round(config.longest_gap_s * NS_PER_S)
+        self._max_gap_ns = round(config.longest_gap_s * NS_PER_S)
         self._coasting = MotionConfig()
-        self._last: tuple[int, int, Pose] | None = None  # frame, time and pose of the last that had one
-        self._velocity: tuple[SE2, float] | None = None  # the last motion, and its duration in s
+        self._last: tuple[int, int, Pose] | None = None  # frame, time and pose of the last frame with a pose
+        self._velocity: tuple[SE2, float] | None = None  # the last motion and its duration in s
 
     def estimate(
         self,
@@ -78,8 +76,8 @@ class ExternalOdometry(WithoutImages):
         road_mask: NDArray[np.bool_] | None = None,
         speeds: Sequence[SpeedReading] = (),
     ) -> Motion | None:
-        """The motion since the last frame that had a pose; None where there is none. The car's speed is not used."""
-        pose, last = self._trajectory.at(frame_id, t_source_ns, self._longest_gap_ns), self._last
+        """The motion since the last frame with a pose; None if there is none. Ignores the car's speed."""
+        pose, last = self._trajectory.at(frame_id, t_source_ns, self._max_gap_ns), self._last
         if last is None or pose is None:
             if pose is not None:
                 self._last = frame_id, t_source_ns, pose
@@ -96,21 +94,21 @@ class ExternalOdometry(WithoutImages):
         return self._motion(last_frame, frame_id, step, T, self._cov(T))
 
     def _coast(self, from_frame: int, from_ns: int, frame_id: int, t_source_ns: int) -> Motion | None:
-        """The prediction at constant velocity; None after too long."""
-        since_s = (t_source_ns - from_ns) / NS_PER_S
-        if since_s > self.config.longest_coast_s:
+        """The constant-velocity prediction; None after `longest_coast_s`."""
+        elapsed_s = (t_source_ns - from_ns) / NS_PER_S
+        if elapsed_s > self.config.longest_coast_s:
             self._last = self._velocity = None
             return None
         T = SE2()
         if self._velocity is not None:
             moved, dt_s = self._velocity
-            T = SE2.exp(moved.log() * (since_s / dt_s))
-        cov = coasting_cov(self._coasting, T, since_s, self._velocity is not None, self.config.sigma_scale_rel)
+            T = SE2.exp(moved.log() * (elapsed_s / dt_s))
+        cov = coasting_cov(self._coasting, T, elapsed_s, self._velocity is not None, self.config.sigma_scale_rel)
         step = on_plane(T, self.camera.ground)
         return self._motion(from_frame, frame_id, step, T, cov, (Status.ODOMETRY_COASTING,))
 
     def _cov(self, T: SE2) -> Floats:
-        """(3, 3) of a motion of the file, in the axes of the pose that it ends in."""
+        """(3, 3) covariance of a motion of the trajectory, in the axes of its end pose."""
         config = self.config
         along = np.array([T.x_m, T.y_m, 0.0])
         across = np.array([-T.y_m, T.x_m, 0.0])

@@ -1,7 +1,7 @@
-"""The interface of the odometry's metric scale (paper, Sec. 3.1, scale-unambiguous ego-motion initialisation).
+"""Interface of the odometry's metric scale (paper, Sec. 3.1, scale-unambiguous ego-motion initialisation).
 
-The scale comes from the known height of the camera over the road. There are two strategies: `road.scale.RoadScale`, a
-Kalman filter, and `road.moving_median.MovingMedianScale`, the paper's moving median.
+The scale follows from the known height of the camera over the road. Implementations: `road.scale.RoadScale`, a Kalman
+filter, and `road.moving_median.MovingMedianScale`, the paper's moving median.
 """
 
 from __future__ import annotations
@@ -24,74 +24,74 @@ from birdslam.types import SpeedReading, SpeedSource, Status
 
 @dataclass(frozen=True)
 class RoadView:
-    """The input of the metric scale from one image, lengths in the odometry's unit."""
+    """Input of the metric scale for one image, in the scale of the window."""
 
     grey: NDArray[np.uint8]  # (H, W)
-    pose: Pose  # in the window's axes
+    pose: Pose  # in the window frame
     boxes_px: NDArray[np.float64]  # (N, 4) vehicles
-    road_mask: NDArray[np.bool_] | None  # (H, W), may be some images old
+    road_mask: NDArray[np.bool_] | None  # (H, W), may be a few images old
     window: SlidingWindow  # its newest keyframe is this image
-    flow_px: float = 0.0  # optical flow of the near road since the last image (speed/zero_velocity.py)
-    interval_ns: tuple[int, int] = (0, 0)  # of the motion, by t_source_ns
-    sigma_across_m: float = 0.0  # 1-sigma of the position across the direction of travel, by the corners
-    sigma_rotation_rad: float = 0.0  # 1-sigma of the rotation, by the corners
-    on_glass: bool = False  # there are corners fixed to the windscreen
+    flow_px: float = 0.0  # optical flow of the near road since the reference image (speed/zero_velocity.py)
+    interval_ns: tuple[int, int] = (0, 0)  # start and end of the motion, t_source_ns
+    sigma_across_m: float = 0.0  # 1-sigma of the lateral position, from the resection
+    sigma_rotation_rad: float = 0.0  # 1-sigma of the rotation, from the resection
+    on_glass: bool = False  # corners are fixed to the windscreen
 
 
 class MetricScale(Protocol):
-    """Turns the odometry's scale into metres, image by image."""
+    """Estimates the factor from the scale of the window to metres, image by image."""
 
-    fit: RoadFit | None  # of the newest image's alignment without its prior, where it was accepted
-    vanishing_point: VanishingPoint | None  # of the newest image, where it was accepted
+    fit: RoadFit | None  # accepted alignment of the newest image, without its prior
+    vanishing_point: VanishingPoint | None  # accepted vanishing point of the newest image
 
     @property
     def bonnet_px(self) -> NDArray[np.float64] | None:
-        """(W, 2) the upper edge of the car's own bonnet in the image; None: none is seen."""
+        """(W, 2) upper edge of the car's own bonnet in the image; None if none is visible."""
 
     @property
     def ground(self) -> GroundPlane:
-        """The present camera over the road; the height is the calibrated one, by which all lengths are measured."""
+        """The current camera over the road; the height is the calibrated one, which defines the scale."""
 
     @property
     def sigma_rel(self) -> float:
-        """1-sigma of the scale as a fraction."""
+        """Relative 1-sigma of the scale."""
 
     @property
     def tilt_cov(self) -> NDArray[np.float64]:
-        """(2, 2) of the ground's pitch and roll."""
+        """(2, 2) covariance of the ground's pitch and roll."""
 
     @property
     def unknown(self) -> bool:
-        """Too vague to be driven by."""
+        """Whether the scale is too uncertain to drive by."""
 
     def restart(self, grey: NDArray[np.uint8], pose: Pose, sigma_rel: float) -> None:
-        """The window restarts with this image; its scale is known to `sigma_rel`."""
+        """Restarts with a new window at this image, whose scale has a 1-sigma of `sigma_rel`."""
 
     def speed_predicted(self, sigma_rel: float) -> None:
-        """The newest motion's length comes from the velocity prior, so the scale is known to `sigma_rel`."""
+        """Raises the 1-sigma of the scale to `sigma_rel`, after a motion whose length the velocity prior gave."""
 
     def lose_tilt(self) -> None:
-        """The camera turned without being seen: its tilt is known no better than by the mount."""
+        """Resets the tilt to the prior of the mount, after a rotation that was not observed."""
 
     def add_readings(self, readings: Iterable[SpeedReading], t_source_ns: int) -> None:
-        """Readings of the car's own speed that had come by the frame of this time."""
+        """Adds the readings of the car's own speed that arrived by the frame of this time."""
 
     def car_motion(self, from_ns: int, to_ns: int) -> CarMotion | None:
-        """The car's motion by its own speed; None where there are no trusted readings."""
+        """The car's motion by its own speed; None without trusted readings."""
 
     @property
     def motion_factor(self) -> float:
-        """The factor on the newest motion alone, beside that on all lengths: its error by the car's own speed."""
+        """Factor on the newest motion only, beside that on all lengths; corrects it by the car's own speed."""
 
     def measure_scale(self, step: Pose, view: RoadView) -> float:
-        """The factor on all lengths, about the present camera, after the motion T_prev_curr `step`."""
+        """Returns the factor on all lengths, about the current camera, after the motion T_prev_curr `step`."""
 
     def status(self) -> list[Status]:
-        """What is wrong with the scale."""
+        """Faults of the scale."""
 
     def car_status(self) -> list[Status]:
-        """What is wrong with the car's own speed."""
+        """Faults of the car's own speed."""
 
     @property
     def sources(self) -> tuple[SpeedSource, ...]:
-        """Where the metres come from."""
+        """Sources of the metric scale."""

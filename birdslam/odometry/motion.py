@@ -1,4 +1,4 @@
-"""One ego-motion: the camera's motion in space, that of its foot on the road, and its covariance."""
+"""One ego-motion: the camera's motion in space, the ego's motion on the road, and its covariance."""
 
 from __future__ import annotations
 
@@ -17,43 +17,39 @@ from birdslam.types import SpeedSource, Status
 Floats = NDArray[np.float64]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 
-_MAX_SLIP = 0.25  # sideways over forwards: the camera may look 5 degrees aside, and a car drifts by as much
-_MAX_AHEAD_M = 2.5  # a bus's camera is so much farther in front of the rear axle than a passenger car's
-_SLIP_NOISE_M = 0.05  # error of the images in a near scene
-_UNEVEN_ROWS = 0.08  # of the image: how far the corners that tell a turn lie from its middle row
+_MAX_SLIP_RATIO = 0.25  # lateral over longitudinal: 5 degrees of camera yaw, and as much sideslip
+_MAX_AHEAD_M = 2.5  # a bus's camera is farther in front of the rear axle than a passenger car's by up to this
+_SLIP_NOISE_M = 0.05  # lateral noise of the visual motion
+_UNEVEN_ROWS = 0.08  # distance of the corners from the middle row, over the image height
 
 
 class MotionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The uncertainty of a motion: measured, stationary, or coasting."""
 
-    # Tuned on KITTI 00, 01, 06, tracking 0005, the raw clip and the shipped drive together, at the truth's own noise:
-    # the mean NEES of one motion is 0.5 to 1.9 on each. Chosen without one of them, that one has 0.6 to 1.2, but 00 2.3
-    covariance_inflation: Positive = 4.0  # of variances: tracks of neighbouring corners err together
-    # ... by night, when corners lie on the glow of lamps and in the light that moves along with the car: two rendered
-    # nights, from six images each, and KITTI 00 with its second half blackened chose between 1 and 64
+    covariance_inflation: Positive = 4.0  # of variances: errors of neighbouring corners are correlated
+    # At night, beside covariance_inflation: corners lie on the glow of lamps and move with the car's headlights
     night_inflation: Positive = 8.0
-    sigma_direction_rad: Positive = 0.0035  # of the direction of travel
-    # By judgement: corners settle no better; focal lengths are known to a percent (00 turns 1.8 % short, 01 0.8 % far)
-    sigma_floor_m: Positive = 0.001  # no motion is known better
-    sigma_floor_rad: Positive = 0.0001  # no turn is known better
-    sigma_turn_rel: Positive = 0.01  # of a turn
-    stationary_sigma_m: Positive = 0.0005  # of a car that stands
-    stationary_sigma_rad: Positive = 0.0001  # of a car that stands
-    coast_acceleration_mps2: Positive = 3.0  # 1-sigma, while nothing is measured
-    coast_yaw_acceleration_radps2: Positive = 0.5  # 1-sigma, while nothing is measured
-    coast_speed_mps: Positive = 0.3  # uncertainty of the last measured speed
-    coast_yaw_rate_radps: Positive = 0.01  # uncertainty of the last measured yaw rate
-    unknown_speed_mps: Positive = 10.0  # where none was ever measured
-    yaw_rate_decay_s: Positive = 1.0  # where the car reports speed without yaw rate, and images show nothing
+    sigma_direction_rad: Positive = 0.0035  # 1-sigma of the direction of travel
+    sigma_floor_m: Positive = 0.001  # minimum 1-sigma of a motion
+    sigma_floor_rad: Positive = 0.0001  # minimum 1-sigma of a turn
+    sigma_turn_rel: Positive = 0.01  # 1-sigma proportional to the turn: focal lengths are known to a percent
+    stationary_sigma_m: Positive = 0.0005  # 1-sigma of a zero-velocity update
+    stationary_sigma_rad: Positive = 0.0001  # 1-sigma of a zero-velocity update
+    coast_acceleration_mps2: Positive = 3.0  # 1-sigma while coasting
+    coast_yaw_acceleration_radps2: Positive = 0.5  # 1-sigma while coasting
+    coast_speed_mps: Positive = 0.3  # 1-sigma of the last measured speed
+    coast_yaw_rate_radps: Positive = 0.01  # 1-sigma of the last measured yaw rate
+    unknown_speed_mps: Positive = 10.0  # 1-sigma before a speed was measured
+    yaw_rate_decay_s: Positive = 1.0  # decay of the last yaw rate while coasting on a speed without yaw rate
 
 
 class Motion(msgspec.Struct, frozen=True):
-    """The camera's motion between two images, in metres; `from_frame` is the last whose motion was measured.
+    """The camera's motion between two images, in metres; `from_frame` is the last frame with a measured motion.
 
-    R_prev_curr (3, 3) and t_prev_curr_m (3,) in camera axes (x right, y down, z forward), p_prev = R p_curr + t.
-    T_prev_curr is the same on the road plane (REP-103) and `cov` (3, 3) the covariance of its tangent (x_m, y_m,
-    yaw_rad), with the scale's uncertainty in it. `ground` is the present camera over the road,
-    `tilt_cov` (2, 2) the covariance of its pitch and roll.
+    R_prev_curr (3, 3) and t_prev_curr_m (3,) are in camera axes (x right, y down, z forward), p_prev = R p_curr + t.
+    T_prev_curr is the same motion on the road plane (REP-103); `cov` (3, 3) is the covariance of its tangent (x_m, y_m,
+    yaw_rad) and includes the scale uncertainty. `ground` is the current camera over the road; `tilt_cov` (2, 2) is the
+    covariance of its pitch and roll.
     """
 
     from_frame: int
@@ -76,8 +72,8 @@ class Motion(msgspec.Struct, frozen=True):
 
 
 def planar(step: Pose, ground: GroundPlane) -> SE2:
-    """The motion of ego on the road, given T_prev_curr of the camera and the road under the present one."""
-    to_ego = ground.R_ego_cam @ step.R.T  # previous camera's axes -> present ego's, whose plane is the same road
+    """The ego's motion on the road, from T_prev_curr of the camera and the ground under the current camera."""
+    to_ego = ground.R_ego_cam @ step.R.T  # previous camera axes to current ego axes
     forward_prev = to_ego[:, 2]
     yaw = -math.atan2(forward_prev[1], forward_prev[0])
     t = to_ego @ step.p
@@ -86,31 +82,32 @@ def planar(step: Pose, ground: GroundPlane) -> SE2:
 
 
 def on_plane(motion: SE2, ground: GroundPlane) -> Pose:
-    """T_prev_curr of the camera, given the motion of ego on the road: `planar`'s inverse where the tilt stays."""
+    """T_prev_curr of the camera, from the ego's motion on the road; the inverse of `planar` at constant tilt."""
     R, (c, s) = ground.R_ego_cam, (math.cos(motion.yaw_rad), math.sin(motion.yaw_rad))
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     return Pose(R.T @ turn @ R, R.T @ np.array([motion.x_m, motion.y_m, 0.0]))
 
 
 def violates_nonholonomic(T_prev_curr: SE2, camera_ahead_m: float) -> bool:
-    """Whether the motion of a driving car slips sideways as its wheels do not allow (nonholonomic constraint).
+    """Whether a motion of a moving car violates the nonholonomic constraint (no lateral slip).
 
-    By night the corners on lights and noise show such motions; so does dirt on the windscreen.
+    Corners on lights or noise at night, and on a dirty windscreen, give such motions.
     """
     forward_m, side_m, yaw_rad = T_prev_curr.log()
-    limit_m = _MAX_SLIP * abs(forward_m) + _MAX_AHEAD_M * abs(yaw_rad) + _SLIP_NOISE_M
+    limit_m = _MAX_SLIP_RATIO * abs(forward_m) + _MAX_AHEAD_M * abs(yaw_rad) + _SLIP_NOISE_M
     return bool(abs(side_m - camera_ahead_m * yaw_rad) > limit_m)
 
 
 def step_cov(config: MotionConfig, info: Floats) -> Floats:
-    """(6, 6) of the camera's step from its information, both of (translation, rotation) in its own axes."""
+    """(6, 6) covariance of the camera's step from its information, of (translation, rotation) in camera axes."""
     return np.asarray(np.linalg.inv(info + np.eye(6) * 1e-3) * config.covariance_inflation, np.float64)
 
 
 def uneven_cov(cov6: Floats, readout_s: float, change_radps: Floats) -> Floats:
-    """(6, 6) of a camera's step whose rows are read over `readout_s`, for a change (3,) of its turn rate per second.
+    """Adds to a step's covariance (6, 6) the rotation error by a rolling shutter with readout time `readout_s`.
 
-    Rows are undone by the last turn, a constant one; by how much a mount that trembles turns in each row no image says.
+    `change_radps` (3,) is the change of the angular velocity since the last image. The correction of the rows assumes
+    a constant angular velocity, which a vibrating mount violates.
     """
     out = cov6.copy()
     out[range(3, 6), range(3, 6)] += (_UNEVEN_ROWS * readout_s) ** 2 * float(change_radps @ change_radps)
@@ -120,7 +117,7 @@ def uneven_cov(cov6: Floats, readout_s: float, change_radps: Floats) -> Floats:
 def measured_cov(
     config: MotionConfig, cov6: Floats, motion: SE2, ground: GroundPlane, scale_sigma_rel: float
 ) -> Floats:
-    """(3, 3) from that of the camera's step, `step_cov`."""
+    """(3, 3) covariance of a measured motion, from that of the camera's step (`step_cov`)."""
     G = np.zeros((3, 6))
     G[:2, :3] = ground.R_ego_cam[:2]
     G[2, 3:] = ground.R_ego_cam[2]
@@ -133,12 +130,12 @@ def measured_cov(
 
 
 def stationary_cov(config: MotionConfig) -> Floats:
-    """(3, 3) of a zero-velocity update: small, since all images of one stop are compared with the same one."""
+    """(3, 3) covariance of a zero-velocity update; small, since all images of a stop share one reference image."""
     return np.diag([config.stationary_sigma_m**2, config.stationary_sigma_m**2, config.stationary_sigma_rad**2])
 
 
 def car_cov(config: MotionConfig, motion: SE2, sigma_m: float, scale_sigma_rel: float, yaw_sigma_rad: float) -> Floats:
-    """(3, 3) of a motion by wheel odometry: errors of its length, of the speed's scale, of the turn along the arc."""
+    """(3, 3) covariance of wheel odometry: errors of the distance, of the speed's scale factor and of the turn."""
     xy = np.array([motion.x_m, motion.y_m, 0.0])
     floor = config.sigma_floor_m**2
     sideways = floor + (config.sigma_direction_rad * math.hypot(motion.x_m, motion.y_m)) ** 2
@@ -151,7 +148,7 @@ def car_cov(config: MotionConfig, motion: SE2, sigma_m: float, scale_sigma_rel: 
 def coasting_cov(
     config: MotionConfig, motion: SE2, dt_s: float, speed_known: bool, scale_sigma_rel: float
 ) -> Floats:  # fmt: skip
-    """(3, 3) of the motion model's prediction over `dt_s`: how far accelerations may have changed it."""
+    """(3, 3) covariance of the motion model's prediction over `dt_s`, by unknown accelerations."""
     speed = config.coast_speed_mps if speed_known else config.unknown_speed_mps
     length = math.hypot(motion.x_m, motion.y_m)
     along = 0.5 * config.coast_acceleration_mps2 * dt_s**2 + speed * dt_s

@@ -1,4 +1,4 @@
-"""The record of each motion: measured, stationary, predicted, or by wheel odometry alone; with what is wrong."""
+"""Builds the record of a motion (measured, stationary, predicted or wheel odometry) with its statuses."""
 
 from __future__ import annotations
 
@@ -27,25 +27,26 @@ from birdslam.types import SpeedSource, Status
 
 Floats = NDArray[np.float64]
 
-_VAGUE_MPS = 1.0  # of a speed, 1-sigma: a car that creeps may know its steps to a half
+_MIN_VAGUE_MPS = 1.0  # a motion with a smaller 1-sigma of its speed is valid, however slow the car
 
 
 @dataclass(frozen=True)
 class MotionRecords:
-    """Reads the metric scale and the motion model, and changes neither."""
+    """Builds motions from the metric scale and the motion model; changes neither."""
 
     config: MotionConfig
-    camera_ahead_m: float  # of the rear axle
+    camera_ahead_m: float  # distance from the rear axle to the camera
     scale: MetricScale
     model: MotionModel
-    invalid_sigma_rel: float  # of a length: no better known, it is not to be driven by
+    invalid_sigma_rel: float  # relative 1-sigma of a length above which it is invalid
 
     def measured(
         self, frames: tuple[int, int], step: Pose, cov6: Floats, obstructed: bool, dt_s: float, earlier_m: float
     ) -> Motion:
-        """Of a step T_prev_curr in metres over `dt_s` with covariance (6, 6); `obstructed`: corners were left out.
+        """The record of a step T_prev_curr in metres over `dt_s` with covariance (6, 6).
 
-        So much as `earlier_m` of it may be of the images before, in which nothing was seen to move.
+        `obstructed`: fixed corners were excluded. Up to `earlier_m` of the step may belong to earlier images, in which
+        no motion was visible.
         """
         T_prev_curr = planar(step, self.scale.ground)
         cov = measured_cov(self.config, cov6, T_prev_curr, self.scale.ground, self.scale.sigma_rel)
@@ -54,34 +55,34 @@ class MotionRecords:
         if obstructed and Status.VIEW_OBSTRUCTED not in status:
             status.append(Status.VIEW_OBSTRUCTED)
         by_images = SpeedSource.CAR not in self.scale.sources
-        if by_images and self._is_vague(step, cov6, dt_s) and Status.SCALE_INVALID not in status:
+        if by_images and self._is_length_uncertain(step, cov6, dt_s) and Status.SCALE_INVALID not in status:
             status.append(Status.SCALE_INVALID)
         return self._record(frames, step, T_prev_curr, cov, status)
 
-    def _is_vague(self, step: Pose, cov6: Floats, dt_s: float) -> bool:
-        """Whether the corners leave the step's own length unknown, however well the scale is known."""
+    def _is_length_uncertain(self, step: Pose, cov6: Floats, dt_s: float) -> bool:
+        """Whether the corners do not determine the length of the step, however certain the scale is."""
         length_m = float(np.linalg.norm(step.p))
         along = step.p / max(length_m, 1e-9)
         sigma_m = math.sqrt(float(along @ cov6[:3, :3] @ along))
-        return sigma_m > max(self.invalid_sigma_rel * length_m, _VAGUE_MPS * dt_s)
+        return sigma_m > max(self.invalid_sigma_rel * length_m, _MIN_VAGUE_MPS * dt_s)
 
-    def standing(self, frames: tuple[int, int], unseen_m: float) -> Motion:
-        """Of a zero-velocity update; no standstill with `unseen_m`, 1-sigma of a motion that was not seen."""
+    def stationary(self, frames: tuple[int, int], unseen_m: float) -> Motion:
+        """The record of a zero-velocity update; no standstill if `unseen_m`, 1-sigma of invisible motion, is > 0."""
         cov = stationary_cov(self.config)
         cov[0, 0] += unseen_m**2
         return self._record(frames, NO_MOTION, SE2(), cov, [] if unseen_m else [Status.STANDSTILL])
 
     def coasted(self, frames: tuple[int, int], dt_s: float, status: list[Status], car: CarMotion | None) -> Motion:
-        """The motion model's prediction, or wheel odometry where the car reports its speed."""
+        """The record of a prediction by the motion model, or by wheel odometry if `car` is given."""
         if car is not None:
-            return self._by_wheels(frames, dt_s, status, car)
+            return self._by_wheel_odometry(frames, dt_s, status, car)
         step = self.model.predict(dt_s)
         T_prev_curr = planar(step, self.scale.ground)
         cov = coasting_cov(self.config, T_prev_curr, dt_s, self.model.known, self.scale.sigma_rel)
         return self._record(frames, step, T_prev_curr, cov, [*status, Status.ODOMETRY_COASTING])
 
-    def _by_wheels(self, frames: tuple[int, int], dt_s: float, status: list[Status], car: CarMotion) -> Motion:
-        """The motion by the car's own speed; without its yaw rate the last turn decays."""
+    def _by_wheel_odometry(self, frames: tuple[int, int], dt_s: float, status: list[Status], car: CarMotion) -> Motion:
+        """The record of a motion by the car's own speed."""
         if car.yaw_rad is None:
             status = [*status, Status.ODOMETRY_COASTING]
         last_radps = planar(self.model.predict(1.0), self.scale.ground).yaw_rad
@@ -98,14 +99,14 @@ class MotionRecords:
         status: list[Status],
         car_sigma_rel: float | None = None,
     ) -> Motion:
-        """`car_sigma_rel`: 1-sigma of the metres where they are the car's alone."""
+        """`car_sigma_rel` is the relative 1-sigma of the scale if the motion is by the car's own speed alone."""
         scale, sources = self.scale, self.scale.sources
         if car_sigma_rel is not None:
             sources = (SpeedSource.CAR,)
         elif Status.ODOMETRY_COASTING in status:
             sources = (SpeedSource.CARRIED,)
         if car_sigma_rel is None and scale.unknown and Status.SCALE_INVALID not in status:
-            status = [*status, Status.SCALE_INVALID]  # stationary or coasting, in an unknown scale
+            status = [*status, Status.SCALE_INVALID]  # stationary or coasting at an unknown scale
         return Motion(
             from_frame=frames[0],
             to_frame=frames[1],
@@ -125,9 +126,9 @@ class MotionRecords:
 def wheel_odometry(
     config: MotionConfig, car: CarMotion, last_yaw_rate_radps: float, dt_s: float, camera_ahead_m: float
 ) -> tuple[SE2, Floats]:
-    """T_prev_curr of the camera over `dt_s` and its covariance (3, 3), of a car that rolls on its rear axle.
+    """T_prev_curr of the camera over `dt_s` and its covariance (3, 3), by wheel odometry about the rear axle.
 
-    Without the car's yaw rate the last one decays. The camera is `camera_ahead_m` in front of the rear axle.
+    Without a yaw rate of the car the last one decays. The camera is `camera_ahead_m` in front of the rear axle.
     """
     yaw_rad, yaw_sigma_rad = car.yaw_rad, car.yaw_sigma_rad
     if yaw_rad is None:

@@ -1,4 +1,4 @@
-"""The parameters of the odometry; those of each part stand beside it."""
+"""Configuration of the odometry."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ Count = Annotated[int, msgspec.Meta(ge=1)]
 
 
 class OdometryConfig(KeyframeConfig, frozen=True, forbid_unknown_fields=True):
-    """One setting for every camera, road and frame rate."""
+    """Parameters of the odometry, the same for every camera, road and frame rate."""
 
     features: FeatureConfig = FeatureConfig()
     road: RoadScaleConfig = RoadScaleConfig()
     motion: MotionConfig = MotionConfig()
     start: InitialisationConfig = InitialisationConfig()
-    two_view_px: Positive = 0.7  # inlier limit of the pose from two images, where the window does not show it
-    min_fitting: Count = 18  # inliers among the landmarks, for a pose to count as measured
-    min_fitting_fraction: Positive = 0.35  # and their ratio to the landmarks in sight
-    max_speed_mps: Positive = 70.0  # a faster motion is no measurement
-    max_coast_s: Positive = 1.0  # after that the window restarts
+    two_view_px: Positive = 0.7  # inlier threshold of a two-view pose
+    min_fitting: Count = 18  # minimum inliers of a resection
+    min_fitting_fraction: Positive = 0.35  # minimum ratio of inliers to visible landmarks
+    max_speed_mps: Positive = 70.0  # a resection with a faster motion is rejected
+    max_coast_s: Positive = 1.0  # maximum coasting time; then the window restarts
     zero_velocity: ZeroVelocityConfig = ZeroVelocityConfig()
     fixed_corners: FixedCornersConfig = FixedCornersConfig()
     constant_velocity: ConstantVelocityConfig = ConstantVelocityConfig()

@@ -1,4 +1,4 @@
-"""The configuration of the metric scale and of the road's tilt; each constant's data stand in docs/constants.md."""
+"""Configuration of the metric scale and of the camera's tilt against the road."""
 
 from __future__ import annotations
 
@@ -17,60 +17,55 @@ Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 
 
 class RoadScaleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The metric scale and the tilt over time.
+    """Parameters of the metric scale and of the tilt.
 
-    `mode` is the strategy: "kalman" is `road.scale.RoadScale`, "paper" `road.moving_median.MovingMedianScale`.
+    `mode` selects `road.scale.RoadScale` ("kalman") or `road.moving_median.MovingMedianScale` ("paper").
     """
 
-    mode: Literal["kalman", "paper"] = "kalman"  # of the metric scale: a Kalman filter, or the paper's moving median
+    mode: Literal["kalman", "paper"] = "kalman"  # Kalman filter, or the paper's moving median
     align: RoadAlignConfig = RoadAlignConfig()
     fixed_pattern: FixedPatternConfig = FixedPatternConfig()
     bonnet: BonnetConfig = BonnetConfig()
     vanishing_point: VanishingPointConfig = VanishingPointConfig()
-    min_baseline_m: Positive = 0.35  # travelled between the two images
-    target_baseline_m: Positive = 1.1  # the keyframe image nearest to this is aligned with
-    keyframes: Annotated[int, msgspec.Meta(ge=2)] = 8  # keyframe images of the road
-    # of the two images of the road; less is a rejection
+    min_baseline_m: Positive = 0.35  # minimum distance between the two aligned images
+    target_baseline_m: Positive = 1.1  # preferred distance between the two aligned images
+    keyframes: Annotated[int, msgspec.Meta(ge=2)] = 8  # number of keyframe images of the road
+    # of the two images of the road; an alignment with less is rejected
     min_correlation: Annotated[float, msgspec.Meta(gt=0.0, lt=1.0)] = 0.35
-    max_innovation_sigma: Positive = 4.0  # an alignment farther from its prediction is rejected
-    confirmations: Annotated[int, msgspec.Meta(ge=1)] = 3  # alignments in a row before a scale counts as known
-    doubt_sigma_rel: Positive = 0.15  # above it lengths far from the present one are searched for
-    doubt_after: Annotated[int, msgspec.Meta(ge=1)] = 3  # rejected alignments in a row that begin such a search
-    violated_after: Annotated[int, msgspec.Meta(ge=1)] = 5  # rejected alignments in a row until the ground is doubtful
-    sigma_scale_floor_rel: Positive = 0.015  # of one alignment, at the least: the road is no perfect plane
-    sigma_tilt_floor_rad: Positive = 0.004  # of one alignment, at the least
-    sigma_bounce_rad: Positive = 0.012  # pitch and roll of the body about their mean, one sample in bounce_m
+    max_innovation_sigma: Positive = 4.0  # gate of an alignment
+    confirmations: Annotated[int, msgspec.Meta(ge=1)] = 3  # consecutive alignments until the scale is known
+    doubt_sigma_rel: Positive = 0.15  # above this the length is searched globally
+    doubt_after: Annotated[int, msgspec.Meta(ge=1)] = 3  # consecutive rejected alignments that trigger the search
+    violated_after: Annotated[int, msgspec.Meta(ge=1)] = 5  # consecutive rejected alignments until ground_violated
+    sigma_scale_floor_rel: Positive = 0.015  # minimum 1-sigma of an alignment: the road is not a perfect plane
+    sigma_tilt_floor_rad: Positive = 0.004  # minimum 1-sigma of an alignment
+    sigma_bounce_rad: Positive = 0.012  # 1-sigma of the body's pitch and roll about their mean, one sample per bounce_m
     bounce_m: Positive = 3.0  # correlation length of the body's bounce
-    sigma_travel_rad: Positive = 0.012  # of the direction of travel against the road, over one metre
-    # The corners' error of that direction is correlated while they are in sight. The roads of tests/roads and the
-    # shipped drive behind its windscreens, from six images each, KITTI 00, 01, 06 and 0005 chose it of 0 to 15 m
-    travel_correlation_m: Positive = 3.0
-    # A camera file's pitch this far from the first direction of travel is wrong: bumps and loads make a degree
+    sigma_travel_rad: Positive = 0.012  # 1-sigma of the direction of travel against the road, over one metre
+    travel_correlation_m: Positive = 3.0  # correlation length of that direction's error by the corners
+    # Difference between the camera file's pitch and the first direction of travel above which the file is wrong
     wrong_pitch_rad: Positive = 0.025
-    max_wrong_pitch_rad: Positive = 0.08  # a direction that is off by more is no car's and is not used
-    sigma_mount_rad: Positive = 0.02  # of the calibrated pitch and roll
-    sigma_unseen_rad: Positive = 0.03  # of the tilt after the camera turned without being seen
+    max_wrong_pitch_rad: Positive = 0.08  # a larger difference is not plausible and is ignored
+    sigma_mount_rad: Positive = 0.02  # 1-sigma of the calibrated pitch and roll
+    sigma_unseen_rad: Positive = 0.03  # 1-sigma of the tilt after an unobserved rotation
     scale_walk_rel_per_sqrt_m: Positive = 0.004  # random walk of the visual scale
-    # ... and what of it lasts: the motorway clip drifts by -0.24 % a metre, KITTI 01 by -0.19, 00, 06 and 0005 by 0.04
-    scale_drift_per_m: Positive = 0.0013
-    scale_drift_memory_m: Positive = 100.0  # over which that drift lasts
-    # The walk by the path's curvature: on KITTI 01's ramp of 21 m radius it drifts by 12 % over as many metres
-    scale_walk_bend_sqrt_m: Positive = 0.4
-    max_bend_per_m: Positive = 0.15  # the path's curvature is clipped to it
-    tilt_walk_rad_per_sqrt_m: Positive = 0.003  # crown and grade of the road
-    sigma_curvature_per_m: Positive = 0.0006  # of roads lengthwise: town streets have radii of 500 m and more
+    scale_drift_per_m: Positive = 0.0013  # 1-sigma of the correlated drift of the visual scale
+    scale_drift_memory_m: Positive = 100.0  # correlation length of the drift
+    scale_walk_bend_sqrt_m: Positive = 0.4  # random walk of the visual scale, proportional to the path's curvature
+    max_bend_per_m: Positive = 0.15  # maximum curvature of the path
+    tilt_walk_rad_per_sqrt_m: Positive = 0.003  # random walk of the tilt: crown and grade of the road
+    sigma_curvature_per_m: Positive = 0.0006  # 1-sigma of the vertical curvature: radii of 500 m and more in towns
     curvature_memory_m: Positive = 30.0  # correlation length of crests and sags
-    sigma_curvature_floor_per_m: Positive = 0.0001  # of one alignment, at the least
-    chord_m: Positive = 15.0  # the reported ground plane meets the road at the foot and this far ahead
-    mount_walk_rad_per_sqrt_m: Positive = 0.0007  # of the mean pitch and roll, as loads and tanks change
-    carried_after_m: Positive = 6.0  # without an accepted alignment, until the status says so
-    invalid_sigma_rel: Positive = 0.15  # of the scale; above it a frame is invalid
-    # By judgement: behind rain drawn over recorded drives lengths are off by 1 to 6 %, all the way
-    sigma_on_glass_rel: Positive = 0.03  # of the scale, lasting, while something on the windscreen is in view
+    sigma_curvature_floor_per_m: Positive = 0.0001  # minimum 1-sigma of an alignment
+    chord_m: Positive = 15.0  # the reported ground plane intersects the road at the foot and this far ahead
+    mount_walk_rad_per_sqrt_m: Positive = 0.0007  # random walk of the mount's pitch and roll, by load
+    carried_after_m: Positive = 6.0  # distance without an accepted alignment until scale_carried
+    invalid_sigma_rel: Positive = 0.15  # 1-sigma of the scale above which a frame is invalid
+    sigma_on_glass_rel: Positive = 0.03  # 1-sigma of the systematic scale error behind a dirty windscreen
     mount_change: MountChangeConfig = MountChangeConfig()
     car: CarSpeedConfig = CarSpeedConfig()
     # mode "paper" only
-    median_frames: Annotated[int, msgspec.Meta(ge=1)] = 21  # of the moving median; the paper states none
-    median_landmarks: Annotated[int, msgspec.Meta(ge=1)] = 3  # on the road, or the frame gives no scale
-    median_range_m: Positive = 20.0  # of those landmarks: the paper's depth threshold T
-    median_sigma_depth_rel: Positive = 0.1  # of the depth of a landmark that counts, 1-sigma
+    median_frames: Annotated[int, msgspec.Meta(ge=1)] = 21  # window of the moving median; the paper states none
+    median_landmarks: Annotated[int, msgspec.Meta(ge=1)] = 3  # minimum landmarks on the road for the scale of a frame
+    median_range_m: Positive = 20.0  # maximum depth of those landmarks, the paper's threshold T
+    median_sigma_depth_rel: Positive = 0.1  # maximum 1-sigma of the depth of those landmarks

@@ -1,5 +1,5 @@
-"""Feature corners: tracked by optical flow, resected against landmarks, adjusted over a window of keyframes.
+"""Relative pose from feature tracks: optical flow, resection, and bundle adjustment over a window of keyframes.
 
-Read `feature_tracks` first, then `selection`, `resection` and `sliding_window`. `initialisation` and `two_view` give
-the first motion, where there are no landmarks yet.
+Read `feature_tracks` first, then `selection`, `resection` and `sliding_window`. `initialisation` and `two_view`
+estimate the first motion, before there are landmarks.
 """

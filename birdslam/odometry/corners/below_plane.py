@@ -1,9 +1,7 @@
-"""Below-plane outliers: landmarks that appear to lie below the road surface they are seen on.
+"""Below-plane outliers: landmarks that are triangulated beyond the intersection of their ray with the road.
 
-A ray below the horizon meets the road; a landmark triangulated well beyond that point is wrong. It moves along with the
-car (another car, the glow of lamps, dirt on the windscreen), slides along a lane line, or was mismatched with a
-repetition of itself (the posts of a guard rail). Such corners agree with one another on a rotation that is too small or
-on no motion at all, so that a robust kernel does not reject them.
+Such corners move with the car (another car, the glow of lamps, dirt on the windscreen), slide along a line, or are
+mismatched on a repeated texture. They are mutually consistent, so that a robust kernel does not reject them.
 """
 
 from __future__ import annotations
@@ -25,23 +23,22 @@ Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 
 
 class BelowPlaneConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """When a landmark is an outlier. By judgement. On KITTI 00, 01 and 06 some 2 to 14 of 1000 corners below the
-    horizon are, on the two rendered nights every third, on 0005 without boxes every fourth (the car ahead)."""
+    """Thresholds of a below-plane outlier."""
 
-    depth_ratio: Positive = 2.0  # of the landmark's depth to the road's, at the least
-    far_m: Positive = 40.0  # beyond it nothing is rejected: crests and dips hide more of the road there
-    sigmas: Positive = 2.0  # of the inverse depth, by which the landmark must be too far
+    depth_ratio: Positive = 2.0  # minimum ratio of the landmark's depth to the road's
+    far_m: Positive = 40.0  # maximum depth of the road: crests and dips hide the road beyond
+    sigmas: Positive = 2.0  # significance, in sigmas of the inverse depth
 
 
 class BelowPlaneFilter:
-    """State: the ids of the rejected corners, for as long as they are tracked. Reader: `CornerSelector`."""
+    """State: the ids of the rejected corners while they are tracked. Reader: `CornerSelector`."""
 
     def __init__(self, camera: Camera, config: BelowPlaneConfig) -> None:
         self.camera, self.config = camera, config
         self._ids: Ints = np.zeros(0, np.int64)
 
     def update(self, window: SlidingWindow, pose: Pose, ground: GroundPlane) -> None:
-        """Tests the landmarks (in metres) from a camera at `pose`; the depth of an outlier is set to unknown."""
+        """Tests the landmarks (metres) from a camera at `pose`; sets the depth of an outlier to unknown."""
         cfg = self.config
         with np.errstate(invalid="ignore"):
             seen, inverse_depths = window.seen_from(pose)
@@ -52,7 +49,7 @@ class BelowPlaneFilter:
         self._ids = np.union1d(self._ids, window.ids[outlier])
 
     def inliers(self, ids: Ints) -> Bools:
-        """(N,) which of the corners (N,), ascending, are no outliers. Outliers that are not tracked are forgotten."""
+        """(N,) inliers among the corners (N,), ascending. Removes outliers that are no longer tracked."""
         outlier, at = match_ids(self._ids, ids)
         self._ids = self._ids[outlier]
         inlier = np.ones(len(ids), bool)

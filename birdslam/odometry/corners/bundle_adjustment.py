@@ -1,8 +1,7 @@
-"""Bundle adjustment of the sliding window: the keyframes' poses and the landmarks' inverse depths together.
+"""Bundle adjustment of the sliding window: keyframe poses and inverse depths of landmarks.
 
-Gauss-Newton on robust reprojection errors in pixels. Each landmark is one number, so that the Schur complement of the
-normal equations divides by scalars. Arrays are (F keyframes, M landmarks), the landmarks last, where numpy is fast;
-what was not seen, or is the anchor's own observation, has weight 0.
+Gauss-Newton on robust reprojection errors in pixels. A landmark has one parameter, so that the Schur complement divides
+by scalars. Arrays are (F keyframes, M landmarks); missing observations and those of the anchor have weight 0.
 """
 
 from __future__ import annotations
@@ -22,24 +21,24 @@ Bools = NDArray[np.bool_]
 _MIN_LANDMARKS = 8
 _HUBER_SIGMA = 1.5
 _CONVERGED = 1e-5
-_POSITION_PRIOR_SHARE = 0.1
+_POSITION_PRIOR_SIGMA_RATIO = 0.1
 
 
 def adjust(window: SlidingWindow, iterations: int, max_landmarks: int, prior: Floats) -> None:
     """Adjusts all poses of the window but the oldest, and the `max_landmarks` landmarks with most observations.
 
-    `prior` (6,) is the information of each pose (translation, rotation vector) against its previous estimate. It damps,
-    and it holds the scale, which no image observes, at the mean of all poses. Fixing two poses would hold it
-    too, but with the error of one short baseline. A position from the velocity prior keeps _POSITION_PRIOR_SHARE of its
-    sigma: the images are in it already.
+    `prior` (6,) is the information of each pose (translation, rotation vector) about its previous estimate. It fixes
+    the gauge freedom of the scale by the mean of all poses; fixing two poses would give it the error of one short
+    baseline. A position from the velocity prior gets _POSITION_PRIOR_SIGMA_RATIO of its sigma, since it includes the
+    images.
     """
     problem = _select(window, max_landmarks)
     if problem is None:
         return
     free = len(window.poses) - 1
     priors = np.tile(prior, (free, 1))
-    priors[:, :3] += 1.0 / np.square(_POSITION_PRIOR_SHARE * np.array(window.predicted_sigma_m[1:]))[:, None]
-    total = np.zeros((free, 6))  # sum of the steps: (translation, rotation vector), both in the window's axes
+    priors[:, :3] += 1.0 / np.square(_POSITION_PRIOR_SIGMA_RATIO * np.array(window.predicted_sigma_m[1:]))[:, None]
+    total = np.zeros((free, 6))  # sum of the steps (translation, rotation vector), in window axes
     rho = window.rho[problem.landmarks].copy()
     for k in range(iterations):
         residuals = _reproject(window, problem, rho, outlier_factor=2.0 if k == 0 else 1.0)
@@ -58,41 +57,41 @@ def adjust(window: SlidingWindow, iterations: int, max_landmarks: int, prior: Fl
 
 @dataclass(frozen=True)
 class _Problem:
-    """The landmarks that are adjusted and their observations; landmarks of one anchor are adjacent."""
+    """The adjusted landmarks, sorted by anchor, and their observations."""
 
-    landmarks: Ints  # (M,) of the window
+    landmarks: Ints  # (M,) indices in the window
     anchor: Ints  # (M,) ascending
     groups: list[slice]  # the landmarks of each anchor
-    rays: Floats  # (3, M) of the anchor's observation
-    observed: Bools  # (F, M) by another keyframe than the anchor
+    rays: Floats  # (3, M) observations by the anchors
+    observed: Bools  # (F, M) by keyframes other than the anchor
     target: Floats  # (F, 2, M) normalised coordinates
-    J_anchor: Floats  # (F, 6, 2, M) a buffer: whitened derivatives by the anchor's pose
+    J_anchor: Floats  # (F, 6, 2, M) buffer: whitened derivatives by the anchor's pose
 
 
 @dataclass(frozen=True)
 class _Residuals:
-    """Reprojection errors of all observations, and their geometry."""
+    """Reprojection errors of all observations and their geometry."""
 
-    rays_window: Floats  # (3, M) the rays in the window's axes
+    rays_window: Floats  # (3, M) in window axes
     to_anchor: Floats  # (F, 3, M) from each keyframe to the anchor
     norm: Floats  # (F, M) in sigma
     whitened: Floats  # (F, 2, M)
-    E: Floats  # (F, 3, 2, M) whitened derivative of both coordinates by the landmark in the window's axes
+    E: Floats  # (F, 3, 2, M) whitened derivative of both coordinates by the landmark in window axes
 
 
 @dataclass(frozen=True)
 class _NormalEquations:
-    """J^T J and J^T r over the poses but the oldest (6 each) and the inverse depths."""
+    """J^T J and J^T r over all poses but the oldest (6 each) and the inverse depths."""
 
     A: Floats  # (F, 6, F, 6) poses by poses
     B: Floats  # (M, 6 (F - 1)) depths by poses
-    C: Floats  # (M,) the depths' diagonal
+    C: Floats  # (M,) diagonal of the depths
     g: Floats  # (F, 6)
     g_rho: Floats  # (M,)
 
 
 def _select(window: SlidingWindow, max_landmarks: int) -> _Problem | None:
-    """The landmarks with most observations; None where there is nothing to adjust."""
+    """Selects the landmarks with most observations; None if there are too few."""
     anchor = window.anchors()
     count = np.isfinite(window.obs[..., 0]).sum(axis=0)
     usable = np.isfinite(window.rho) & (count >= 2)
@@ -117,7 +116,7 @@ def _select(window: SlidingWindow, max_landmarks: int) -> _Problem | None:
 
 
 def _reproject(window: SlidingWindow, problem: _Problem, rho: Floats, outlier_factor: float) -> _Residuals:
-    """Errors of all observations; beyond `outlier_factor` times the window's limit an observation has weight 0."""
+    """Errors of all observations; the weight is 0 beyond `outlier_factor` times the window's outlier threshold."""
     R, p = window.stacked()
     f, sigma_px = window.focal_px, window.sigma_px
     rays_window = np.concatenate([R[i] @ problem.rays[:, of] for i, of in enumerate(problem.groups)], axis=1)
@@ -137,11 +136,11 @@ def _reproject(window: SlidingWindow, problem: _Problem, rho: Floats, outlier_fa
 
 
 def _normal_equations(problem: _Problem, residuals: _Residuals, rho: Floats) -> _NormalEquations:
-    """The linearised problem.
+    """Linearises the problem.
 
     The derivative of a residual by the observing pose is -L times that by the anchor's pose, with L = [I 0; [b]x I] and
-    b the vector between the two positions: the same for all landmarks of an anchor. So only products of the anchor's
-    derivatives are summed over landmarks.
+    the baseline b. L is the same for all landmarks of an anchor, so that only products of the anchor's derivatives are
+    summed over landmarks.
     """
     F, anchor = len(problem.groups), problem.anchor
     E, J_anchor, rw = residuals.E, problem.J_anchor, residuals.whitened
@@ -149,7 +148,7 @@ def _normal_equations(problem: _Problem, residuals: _Residuals, rho: Floats) -> 
     np.multiply(E, rho, out=J_anchor[:, :3])
     _cross(residuals.rays_window[None, :, None], E, J_anchor[:, 3:])
 
-    N, n = np.zeros((F, F, 6, 6)), np.zeros((F, F, 6))  # J J^T and J r of the derivatives, (anchor, seen by)
+    N, n = np.zeros((F, F, 6, 6)), np.zeros((F, F, 6))  # J J^T and J r, (anchor, observer)
     L = np.zeros((F, F, 6, 6))
     L[..., range(6), range(6)] = 1.0
     for i, of in enumerate(problem.groups):
@@ -161,7 +160,7 @@ def _normal_equations(problem: _Problem, residuals: _Residuals, rho: Floats) -> 
         x, y, z = residuals.to_anchor[:, :, of.start].T
         L[i, :, 3, 1], L[i, :, 3, 2], L[i, :, 4, 2] = -z, y, -x
         L[i, :, 4, 0], L[i, :, 5, 0], L[i, :, 5, 1] = z, -y, x
-    mixed = -N @ L.swapaxes(2, 3)  # nothing where the keyframe is the anchor
+    mixed = -N @ L.swapaxes(2, 3)  # 0 where the observer is the anchor
     A = mixed.transpose(0, 2, 1, 3) + mixed.transpose(1, 3, 0, 2)
     A[range(F), :, range(F)] += N.sum(axis=1) - (L @ mixed).sum(axis=0)
     g = n.sum(axis=1) - (L @ n[..., None])[..., 0].sum(axis=0)
@@ -178,9 +177,9 @@ def _normal_equations(problem: _Problem, residuals: _Residuals, rho: Floats) -> 
 
 
 def _solve(normal: _NormalEquations, priors: Floats, total: Floats) -> tuple[Floats, Floats]:
-    """Steps of the poses but the oldest (F - 1, 6), and those of the inverse depths (M,), to be subtracted.
+    """Steps of all poses but the oldest (F - 1, 6), and steps of the inverse depths (M,), to be subtracted.
 
-    `priors` (F - 1, 6) are the poses' information. The depths are eliminated first (Schur complement).
+    `priors` (F - 1, 6) is the information of the poses. The depths are eliminated by the Schur complement.
     """
     free, B, C = len(total), normal.B, normal.C
     A = normal.A[1:, :, 1:].reshape(6 * free, 6 * free) + np.diag(priors.ravel())
@@ -193,7 +192,7 @@ def _solve(normal: _NormalEquations, priors: Floats, total: Floats) -> tuple[Flo
 def _write_back(
     window: SlidingWindow, problem: _Problem, residuals: _Residuals, normal: _NormalEquations, rho: Floats
 ) -> None:
-    """Writes the result back. A landmark with mostly outlier observations becomes unknown, until triangulated again."""
+    """Writes the result back; resets landmarks with mostly outlier observations to unknown depth."""
     rotations = orthonormal(window.stacked()[0])
     window.poses = [Pose(R, T.p) for R, T in zip(rotations, window.poses, strict=True)]
     window.rho[problem.landmarks] = rho
@@ -204,7 +203,7 @@ def _write_back(
 
 
 def _cross(a: Floats, b: Floats, out: Floats) -> None:
-    """a x b along the second axis of (F, 3, ..., M)."""
+    """Writes a x b along the second axis of (F, 3, ..., M) to `out`."""
     out[:, 0] = a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1]
     out[:, 1] = a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2]
     out[:, 2] = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]

@@ -1,8 +1,7 @@
-"""Feature tracks: corners with persistent ids, tracked from image to image by pyramidal Lucas-Kanade optical flow.
+"""Feature tracks: corners with persistent ids, tracked by pyramidal Lucas-Kanade optical flow.
 
-The paper takes ORB corners (Sec. 3.1, static map initialisation); tracked corners give the same persistent points at
-sub-pixel accuracy and a fraction of the time. No network result is needed, so tracking runs beside the networks
-(OpenCV releases the GIL).
+The paper uses ORB corners (Sec. 3.1, static map initialisation); tracked corners are faster and have sub-pixel
+accuracy. Tracking needs no network result and runs in parallel to the networks, since OpenCV releases the GIL.
 """
 
 from __future__ import annotations
@@ -25,44 +24,46 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-# Lucas-Kanade stops after so many iterations or at a smaller step (px); the backward pass need not be exact
+# Maximum iterations and minimum step (px) of Lucas-Kanade; the backward pass needs less accuracy
 _FORWARD_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 12, 0.03)
 _BACK_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 6, 0.1)
 _BACKWARD_OFFSET_PX = 2.0
-# Of predicted corners: the smallest depth, as a share of the assumed one, and the largest shift, of the image's width
-_MIN_DEPTH_REL, _MAX_SHIFT_REL = 0.3, 0.4
+# Of predicted corners: depth over the assumed depth, displacement over the image width
+_MIN_DEPTH_RATIO, _MAX_SHIFT_RATIO = 0.3, 0.4
 
 
 class FeatureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How corners are found and followed; lengths in pixels; cells are for an image 1242 px wide."""
+    """Parameters of detection and tracking; cell sizes are for an image 1242 px wide."""
 
-    max_tracks: Count = 450  # corners that are tracked at once
-    refill_share: Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)] = 0.3  # of them lost, until new ones are detected
-    cell_px: Count = 24  # at most one new corner in a cell of this size
+    max_tracks: Count = 450  # maximum number of tracked corners
+    refill_share: Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)] = (
+        0.3  # fraction of lost tracks that triggers detection
+    )
+    cell_px: Count = 24  # cell size of detection, one new corner per cell
     min_corner_score: Positive = 8.0  # smaller eigenvalue of the structure tensor, (grey / px)^2, half image
-    # Of Lucas-Kanade: OpenCV processes eight columns at once, so that a ninth costs as much as eight more
+    # Of Lucas-Kanade; a multiple of 8, the columns that OpenCV processes at once
     window_columns_px: Annotated[int, msgspec.Meta(ge=5)] = 8
     window_rows_px: Annotated[int, msgspec.Meta(ge=5)] = 20  # of Lucas-Kanade
-    pyramid_levels: Annotated[int, msgspec.Meta(ge=0, le=6)] = 2  # of Lucas-Kanade, beside the image itself
+    pyramid_levels: Annotated[int, msgspec.Meta(ge=0, le=6)] = 2  # of Lucas-Kanade, in addition to the image
     max_forward_backward_px: Positive = 0.7  # forward-backward error (Kalal et al. 2010)
     start_pyramid_levels: Annotated[int, msgspec.Meta(ge=0, le=6)] = (
-        4  # from a predicted position that was searched for
+        4  # of Lucas-Kanade, from the predictions of a search
     )
     least_followed: Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)] = (
-        0.35  # of the corners; fewer: the prediction is wrong
+        0.35  # minimum ratio of tracked corners; below this the prediction is wrong
     )
-    search_pause: Count = 5  # images after a search that found no better prediction
-    max_residual_grey: Positive = 14.0  # mean absolute difference of the windows (after LK), grey levels
-    dark_mean_grey: Annotated[float, msgspec.Meta(ge=0.0)] = 8.0  # an image that is darker on average is dark
-    dark_std_grey: Annotated[float, msgspec.Meta(ge=0.0)] = 4.0  # and so is one with less contrast
+    search_pause: Count = 5  # images without a search after a search without success
+    max_residual_grey: Positive = 14.0  # maximum mean absolute difference of the windows
+    dark_mean_grey: Annotated[float, msgspec.Meta(ge=0.0)] = 8.0  # mean below which an image is dark
+    dark_std_grey: Annotated[float, msgspec.Meta(ge=0.0)] = 4.0  # standard deviation below which an image is dark
 
 
 @dataclass(frozen=True)
 class Tracks:
-    """Corners of one image. `ids` (N,) ascending and never used twice; `px` (N, 2) pixels (u right, v down).
+    """Corners of one image. `ids` (N,) are ascending and never reused; `px` (N, 2) pixels (u right, v down).
 
-    `age` (N,) counts the images that a corner was tracked through, 0 for a new one. `dark`: too little contrast;
-    `frozen`: bit for bit the image before. In both cases nothing was tracked and the corners are the last ones.
+    `age` (N,) is the number of images through which a corner was tracked, 0 for a new one. `dark`: too little contrast;
+    `frozen`: identical to the previous image. In both cases the corners are those of the reference image.
     """
 
     ids: Ints
@@ -74,14 +75,14 @@ class Tracks:
 
 
 Predict = Callable[[Tracks], Floats]
-Search = Callable[[NDArray[np.uint8], NDArray[np.uint8], Tracks], list[Floats]]  # by both images and the tracks
+Search = Callable[[NDArray[np.uint8], NDArray[np.uint8], Tracks], list[Floats]]  # of both images and the tracks
 
 
 class FeatureTracker:
     """Tracks corners over a stream of images of one size.
 
-    The next image is tracked from the reference image, which `accept` sets. A dark image or one of a stationary car is
-    tracked but does not become the reference, so that tracks are neither lost nor drift.
+    Each image is tracked from the reference image, which `accept` sets. Images of a stationary car do not become the
+    reference, so that tracks do not drift.
     """
 
     def __init__(self, width_px: int, height_px: int, config: FeatureConfig) -> None:
@@ -90,7 +91,7 @@ class FeatureTracker:
         self._reference_image: NDArray[np.uint8] | None = None
         self._candidate: NDArray[np.uint8] | None = None
         self._last_image: NDArray[np.uint8] | None = None
-        self._search_pause_left = 0  # images
+        self._search_pause_left = 0  # image count
         self.drop_reference()
 
     @property
@@ -103,8 +104,8 @@ class FeatureTracker:
     ) -> Tracks:  # fmt: skip
         """Tracks the reference's corners into `image` ((H, W) grey or (H, W, 3) BGR, uint8) and detects new ones.
 
-        `predict` gives the predicted pixels (N, 2) of the reference's tracks. Without it, or where too few tracks
-        confirm it, `search` gives alternative predictions. Raises ValueError for another size.
+        `predict` returns predicted pixels (N, 2) of the reference's tracks. Without it, or if too few tracks confirm
+        it, `search` returns alternative predictions. Raises ValueError for an image of another size.
         """
         grey = self._grey(image)
         frozen = self._last_image is not None and bool(np.array_equal(grey, self._last_image))
@@ -126,18 +127,18 @@ class FeatureTracker:
         return Tracks(ids, np.concatenate([px, fresh]), np.concatenate([age, np.zeros(len(fresh), np.int64)]), grey)
 
     def accept(self, tracks: Tracks) -> None:
-        """Makes the image last tracked the reference of the next one."""
+        """Makes the last tracked image the reference."""
         if self._candidate is not None:
             self._reference_image, self._reference = self._candidate, tracks
 
     def drop_reference(self) -> None:
-        """The next image is tracked from none; the last image is kept for the test of a frozen camera."""
+        """Drops the reference; keeps the last image for the detection of a frozen camera."""
         self._reference_image, self._candidate = None, None
         no_ids = np.zeros(0, np.int64)
         self._reference = Tracks(no_ids, np.zeros((0, 2)), no_ids, np.zeros((0, 0), np.uint8))
 
     def reset(self) -> None:
-        """Forgets all tracks; ids go on counting."""
+        """Drops all tracks; ids are not reused."""
         fresh = FeatureTracker(self.width_px, self.height_px, self.config)
         fresh._next_id = self._next_id
         self.__dict__.update(fresh.__dict__)
@@ -157,9 +158,9 @@ class FeatureTracker:
     def _follow_reference(
         self, then: NDArray[np.uint8], now: NDArray[np.uint8], predict: Predict | None, search: Search | None
     ) -> tuple[Floats, Bools]:
-        """The reference's tracks in the present image (N, 2), and which of them were tracked (N,).
+        """The reference's tracks in the current image (N, 2), and which of them were tracked (N,).
 
-        Where too few were, the prediction was wrong: each corner then takes the searched prediction with the smallest
+        If too few were, the prediction was wrong: each corner then uses the prediction of the search with the smallest
         residual.
         """
         cfg, px = self.config, self._reference.px
@@ -185,7 +186,7 @@ class FeatureTracker:
     def _follow(
         self, then: NDArray[np.uint8], now: NDArray[np.uint8], px: Floats, start: Floats, levels: int
     ) -> tuple[Floats, Bools, Floats]:
-        """New positions (N, 2), which of them are valid (N,), and the residuals there (N,), grey levels."""
+        """New positions (N, 2), their validity (N,), and their residuals (N,) in grey levels."""
         cfg = self.config
         window = (cfg.window_columns_px, cfg.window_rows_px)
         here = px.astype(np.float32).reshape(-1, 1, 2)
@@ -194,8 +195,8 @@ class FeatureTracker:
             then, now, here, guess.copy(), winSize=window, maxLevel=levels,
             criteria=_FORWARD_CRITERIA, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=1e-4,
         )  # fmt: skip  # type: ignore[call-overload]
-        # The backward pass starts off by the prediction's own error, as far as it reaches without a pyramid, and not at
-        # the corner itself: a wrong match must not confirm itself.
+        # The backward pass starts with the prediction's error (limited, since it has no pyramid) instead of at the
+        # corner, so that a wrong match cannot confirm itself
         off = np.clip(there - guess, -_BACKWARD_OFFSET_PX, _BACKWARD_OFFSET_PX)
         back, ok_back, _ = cv2.calcOpticalFlowPyrLK(
             now, then, there, (here + off).astype(np.float32), winSize=window, maxLevel=0,
@@ -212,7 +213,7 @@ class FeatureTracker:
         return end, good, np.where(good, error.ravel(), np.inf)
 
     def _new_corners(self, grey: NDArray[np.uint8], px: Floats) -> Floats:
-        """The best corner of each cell that holds no track, best first, until `max_tracks` are reached."""
+        """The best corner of each cell without tracks, up to `max_tracks` in total."""
         cfg = self.config
         room = cfg.max_tracks - len(px)
         if room <= cfg.refill_share * cfg.max_tracks:
@@ -241,15 +242,15 @@ class FeatureTracker:
 
 
 def predict_corners_px(camera: Camera, ground: GroundPlane, px: Floats, step: Pose) -> Floats:
-    """(N, 2) of corners `px` (N, 2) of unknown depth, after the motion T_prev_curr of `step` in metres.
+    """(N, 2) predicted pixels of corners `px` (N, 2) of unknown depth after the motion T_prev_curr `step` in metres.
 
-    Below the horizon a corner is assumed at twice the road's depth, above it at infinity. One that would leave the
-    image, or move too far, is predicted where it was.
+    Assumes twice the road's depth below the horizon and infinity above it. A corner that would move too far keeps its
+    pixel.
     """
     rays = np.column_stack([camera.to_xy(px), np.ones(len(px))])
     rho = np.maximum(-(rays @ ground.normal_cam) / camera.height_m, 0.0) * 0.5
     q = (rays - rho[:, None] * step.p) @ step.R
     out = camera.to_px(q[:, :2] / np.maximum(q[:, 2:], 0.2))
-    lost = (q[:, 2] < _MIN_DEPTH_REL) | (np.abs(out - px) > _MAX_SHIFT_REL * camera.width_px).any(axis=1)
+    lost = (q[:, 2] < _MIN_DEPTH_RATIO) | (np.abs(out - px) > _MAX_SHIFT_RATIO * camera.width_px).any(axis=1)
     out[lost] = px[lost]
     return out

@@ -1,7 +1,7 @@
-"""Resection: the pose of an image from the landmarks of the window that it shows (perspective-n-point).
+"""Resection: the pose of an image from the landmarks of the window (perspective-n-point).
 
-Gauss-Newton on robust reprojection errors, whose variance includes that of the landmark's depth. Corners fixed in the
-image are left out where they lead to another pose.
+Gauss-Newton on robust reprojection errors, whose variance includes the landmark's depth. Corners fixed in the image are
+excluded if they change the pose.
 """
 
 from __future__ import annotations
@@ -20,32 +20,35 @@ from birdslam.odometry.median import upper_median
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
-PoseEstimate = tuple[Pose, Floats]  # a pose and its information (6, 6), of (translation, rotation) in its own axes
+PoseEstimate = tuple[Pose, Floats]  # a pose and its information (6, 6) of (translation, rotation) in camera axes
 
 _MIN_LANDMARKS = 8
 _HUBER_SIGMA = 1.5
 _ITERATIONS = 8
 _CONVERGED = 1e-5
-_ADAPTIVE_ITERATIONS = 3  # the first ones, in which the outlier limit follows the residuals
-_SAME_RAD, _SAME_REL = 0.0007, 0.05  # two poses agree within this rotation and this share of the translation
-_GOOD_INLIER_RATIO = 0.7  # with so many inliers no further guess is tried
+_ADAPTIVE_ITERATIONS = 3  # first iterations, whose outlier threshold follows the residuals
+_MAX_SAME_RAD, _MAX_SAME_RATIO = (
+    0.0007,
+    0.05,
+)  # maximum difference of equal poses: rotation, and ratio of the translation
+_GOOD_INLIER_RATIO = 0.7  # no further guess is tried above this
 
 
 @dataclass(frozen=True)
 class InlierLimits:
-    """When a pose counts as measured."""
+    """Acceptance limits of a resected pose."""
 
     min_inliers: int  # landmarks
-    min_inlier_ratio: float  # of the landmarks in sight
+    min_inlier_ratio: float  # of the visible landmarks
     max_step_m: float  # since the reference image
 
 
 def pose_without_fixed_corners(
     window: SlidingWindow, corners: Corners, reference: Pose, guesses: Sequence[Pose], limits: InlierLimits
 ) -> tuple[Corners, PoseEstimate | None]:
-    """The corners used and the pose from them: without the fixed ones where these would change the pose.
+    """The corners used and their pose; excludes the fixed corners if they change the pose.
 
-    Parameters as of `pose_from_landmarks`. Returns `corners` itself where none is left out.
+    Parameters are as for `pose_from_landmarks`. Returns `corners` itself if none is excluded.
     """
     both = pose_from_landmarks(window, corners, reference, guesses, limits)
     if not corners.fixed.any():
@@ -55,17 +58,17 @@ def pose_without_fixed_corners(
     if both is None or alone is None:
         return street, alone
     between, step = both[0].between(alone[0]), reference.between(alone[0])
-    turned = float(np.linalg.norm(rotation_log(between.R))) > _SAME_RAD
-    moved = float(np.linalg.norm(between.p)) > _SAME_REL * float(np.linalg.norm(step.p))
+    turned = float(np.linalg.norm(rotation_log(between.R))) > _MAX_SAME_RAD
+    moved = float(np.linalg.norm(between.p)) > _MAX_SAME_RATIO * float(np.linalg.norm(step.p))
     return (street, alone) if turned or moved else (corners, both)
 
 
 def pose_from_landmarks(
     window: SlidingWindow, corners: Corners, reference: Pose, guesses: Sequence[Pose], limits: InlierLimits
 ) -> PoseEstimate | None:
-    """The image's pose in the window's frame and its information (6, 6); None where too few landmarks are inliers.
+    """The image's pose in the window frame and its information (6, 6); None if too few landmarks are inliers.
 
-    `reference` is the pose of the reference image; `guesses` are tried in turn until one has enough inliers.
+    `reference` is the pose of the reference image. Tries the `guesses` in turn until one has enough inliers.
     """
     matches = len(match_ids(corners.ids, window.ids[np.isfinite(window.rho)])[0])
     best: tuple[int, Pose, Floats] | None = None
@@ -83,20 +86,20 @@ def pose_from_landmarks(
 
 @dataclass(frozen=True)
 class _Landmarks:
-    """The N landmarks of known depth that the image shows."""
+    """The N visible landmarks of known depth."""
 
-    scaled: Floats  # (3, N) positions in the window's axes, times the inverse depths
+    scaled: Floats  # (3, N) positions in window axes times the inverse depths
     rho: Floats  # (N,) inverse depth
-    rho_sigma: Floats  # (N,) 0 where unknown
+    rho_sigma: Floats  # (N,) 0 if unknown
     p_anchor: Floats  # (3, N)
     target: Floats  # (2, N) observations, normalised coordinates
 
 
 def resect(window: SlidingWindow, guess: Pose, ids: Ints, xy: Floats) -> tuple[Pose, Bools, Floats]:
-    """The pose from observations of landmarks: ids (N,), xy (N, 2) in normalised coordinates.
+    """Estimates the pose from observations of landmarks: ids (N,), xy (N, 2) in normalised coordinates.
 
-    Returns the pose, the inliers (N,), and the pose's information (6, 6) of (translation, rotation) in the camera's own
-    axes; `guess` and no information where too few landmarks are seen.
+    Returns the pose, the inliers (N,), and the pose's information (6, 6) of (translation, rotation) in camera axes;
+    `guess` and zero information if too few landmarks are visible.
     """
     inliers = np.zeros(len(ids), bool)
     at, known = _match_landmarks(window, ids)
@@ -124,7 +127,7 @@ def resect(window: SlidingWindow, guess: Pose, ids: Ints, xy: Floats) -> tuple[P
 
 
 def _match_landmarks(window: SlidingWindow, ids: Ints) -> tuple[Ints, Bools]:
-    """(N,) index of each id's landmark in the window, and (N,) whether it is there with a known depth."""
+    """(N,) index of each id's landmark in the window, and (N,) whether the landmark exists and has a depth."""
     at = np.searchsorted(window.ids, ids)
     at = np.minimum(at, max(len(window.ids) - 1, 0))
     known = np.zeros(len(ids), bool)
@@ -147,7 +150,7 @@ def _landmarks(window: SlidingWindow, m: Ints, xy: Floats) -> _Landmarks:
 
 
 def _linearise(window: SlidingWindow, seen: _Landmarks, pose: Pose, J: Floats) -> tuple[Floats, Floats, Bools]:
-    """Residuals (2, N) in px, variances (N,), and which landmarks lie ahead; fills the Jacobian J (6, 2, N)."""
+    """Residuals (2, N) in px, variances (N,), and which landmarks lie ahead; writes the Jacobian J (6, 2, N)."""
     f, rho = window.focal_px, seen.rho
     place = (pose.R.T @ pose.p)[:, None]
     q = pose.R.T @ seen.scaled - rho * place
@@ -165,7 +168,7 @@ def _linearise(window: SlidingWindow, seen: _Landmarks, pose: Pose, J: Floats) -
     J[4, 0] = -(f_z + fu * u)
     J[5, 0] = fv
     np.negative(fu, out=J[5, 1])
-    # An uncertain depth blurs the observation along its epipolar line; isotropic is near enough.
+    # The variance of the depth along the epipolar line, approximated as isotropic
     a = pose.R.T @ seen.p_anchor - place
     along = (a[:2] - uv * a[2]) * (by_z * seen.rho_sigma)
     return (uv - seen.target) * f, window.sigma_px**2 + (along[0] ** 2 + along[1] ** 2), ahead

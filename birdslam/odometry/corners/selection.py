@@ -1,7 +1,7 @@
-"""Which corners the ego-motion is estimated from: those of the static street.
+"""Selection of the static corners for the ego-motion.
 
-Left out are corners on vehicles (road/points.py), below-plane outliers (below_plane.py) and, where the windscreen is
-dirty, those fixed in the image (obstruction/fixed_corners.py).
+Excludes corners on vehicles (road/points.py), below-plane outliers (below_plane.py) and, on a dirty windscreen, corners
+that are fixed in the image (obstruction/fixed_corners.py).
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Corners:
-    """The N corners of one image that lie outside vehicles and are no below-plane outliers."""
+    """The N corners of one image outside vehicles, without below-plane outliers."""
 
     ids: Ints  # (N,) ascending
     xy: Floats  # (N, 2) normalised coordinates
-    displacement_px: Floats  # (M,) since the reference image, of those that it shows too and that are not fixed
-    fixed: Bools  # (N,) fixed in the image while the car drives: on the windscreen, or on a line along the road
+    displacement_px: Floats  # (M,) since the reference image, of shared corners that are not fixed
+    fixed: Bools  # (N,) fixed in the image while the car moves
 
     def without_fixed(self) -> Corners:
         """The corners that are not fixed in the image."""
@@ -40,7 +40,7 @@ class Corners:
 
 
 class CornerSelector:
-    """State: that of the two filters. Reader: `Odometry`."""
+    """State: that of its two filters. Reader: `Odometry`."""
 
     def __init__(self, camera: Camera, fixed_corners: FixedCornersConfig, below_plane: BelowPlaneConfig) -> None:
         self._camera = camera
@@ -49,17 +49,17 @@ class CornerSelector:
 
     @property
     def obstructed(self) -> bool:
-        """Whether there are corners on the glass."""
+        """Whether corners are fixed to the windscreen."""
         return self._fixed_corners.present
 
     def select(
-        self, tracks: Tracks, reference: Tracks, boxes_px: Floats, ground: GroundPlane, driven_m: float | None
+        self, tracks: Tracks, reference: Tracks, boxes_px: Floats, ground: GroundPlane, travelled_m: float | None
     ) -> Corners:
-        """The corners of the present image; `driven_m` is the car's travel since the image before, None if unknown."""
+        """The corners of the current image; `travelled_m` is since the previous image, None if unknown."""
         static = outside(tracks.px, boxes_px, is_night(tracks.image))
         ids, px = tracks.ids[static], tracks.px[static]
-        self._fixed_corners.begin(reference.ids, reference.px)
-        fixed = self._fixed_corners.update(ids, px, ground, driven_m)
+        self._fixed_corners.start(reference.ids, reference.px)
+        fixed = self._fixed_corners.update(ids, px, ground, travelled_m)
         inlier = self._below_plane.inliers(ids)
         ids, px, fixed = ids[inlier], px[inlier], fixed[inlier]
         fixed &= self.obstructed
@@ -69,6 +69,6 @@ class CornerSelector:
         return Corners(ids, self._camera.to_xy(px), displacement, fixed)
 
     def reject_below_plane(self, window: SlidingWindow, pose: Pose, ground: GroundPlane) -> None:
-        """Rejects landmarks of the window, which is in metres; not behind a dirty windscreen, whose depths err."""
+        """Rejects below-plane landmarks of the window (metres); disabled on a dirty windscreen."""
         if not self._fixed_corners.present:
             self._below_plane.update(window, pose, ground)

@@ -1,7 +1,7 @@
-"""The sliding window of the odometry: the last keyframes and the landmarks that they share.
+"""Sliding window of the odometry: the last keyframes and their landmarks.
 
-A landmark is parametrised by its inverse depth along the ray of its anchor, the first keyframe of the window that saw
-it (Civera et al. 2008). Coordinates are normalised ones of an undistorted camera; the scale is the caller's.
+A landmark is parametrised by its inverse depth along the ray of its anchor, the first keyframe of the window that
+observes it (Civera et al. 2008). Coordinates are normalised; the scale is arbitrary.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from birdslam.geometry.pose import Pose
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-MIN_DEPTH = 1e-3  # of a ray's own length: nearer or behind counts as not visible
+MIN_DEPTH = 1e-3  # z over the length of the ray; below this a point is not visible
 
 
 def match_ids(a: Ints, b: Ints) -> tuple[Ints, Ints]:
-    """Indices in a (N,) and in b (M,), both ascending, of the ids that both have; numpy.intersect1d would sort them."""
+    """Indices of the common ids in a (N,) and in b (M,), both ascending; faster than numpy.intersect1d."""
     at = np.searchsorted(b, a)
     at[at == len(b)] = 0
     both = np.flatnonzero(b[at] == a) if len(b) else np.zeros(0, np.int64)
@@ -29,7 +29,7 @@ def match_ids(a: Ints, b: Ints) -> tuple[Ints, Ints]:
 def rotate_rays(R: Floats, anchor: Ints, xy: Floats) -> Floats:
     """(3, M) rays of normalised coordinates (M, 2), each rotated by R[anchor], R (F, 3, 3), anchor (M,).
 
-    Written out, since M products of small matrices take numpy twice as long.
+    Expanded, since M products of small matrices are slower in numpy.
     """
     by, (x, y) = R.transpose(1, 2, 0).reshape(9, -1).take(anchor, axis=1), xy.T
     out: Floats = by[::3] * x + by[1::3] * y + by[2::3]
@@ -39,7 +39,7 @@ def rotate_rays(R: Floats, anchor: Ints, xy: Floats) -> Floats:
 class SlidingWindow:
     """F keyframes, oldest first (the newest may be provisional), and M landmarks.
 
-    `focal_px` scales residuals to pixels, `sigma_px` is the noise of a track, `reject_px` the residual of an outlier.
+    `focal_px` scales residuals to pixels, `sigma_px` is the noise of a track, `reject_px` is the outlier threshold.
     """
 
     def __init__(self, focal_px: float, sigma_px: float, reject_px: float) -> None:
@@ -48,14 +48,14 @@ class SlidingWindow:
         self.frames: list[int] = []
         self.predicted_sigma_m: list[
             float
-        ] = []  # 1-sigma of a position from the velocity prior; inf where the images gave it
+        ] = []  # 1-sigma of a position by the velocity prior; inf if it is by the images
         self.ids: Ints = np.zeros(0, np.int64)  # (M,) ascending
-        self.obs: Floats = np.zeros((0, 0, 2))  # (F, M, 2), NaN where not seen
-        self.rho: Floats = np.zeros(0)  # (M,) inverse depth along the anchor's ray (z = 1), NaN unknown
+        self.obs: Floats = np.zeros((0, 0, 2))  # (F, M, 2), NaN if not observed
+        self.rho: Floats = np.zeros(0)  # (M,) inverse depth along the anchor's ray (z = 1), NaN if unknown
         self.rho_sigma: Floats = np.zeros(0)
 
     def anchors(self) -> Ints:
-        """(M,) index of each landmark's anchor."""
+        """(M,) index of each landmark's anchor keyframe."""
         out: Ints = np.isfinite(self.obs[..., 0]).argmax(axis=0)
         return out
 
@@ -65,7 +65,7 @@ class SlidingWindow:
         return out
 
     def append(self, frame: int, pose: Pose, ids: Ints, xy: Floats, predicted_sigma_m: float = np.inf) -> None:
-        """A new keyframe: ids (N,) ascending, xy (N, 2) normalised coordinates; `predicted_sigma_m` as in the class."""
+        """Appends a keyframe: ids (N,) ascending, xy (N, 2) normalised; `predicted_sigma_m` as in the class."""
         merged = np.concatenate([self.ids, ids])
         merged.sort(kind="stable")
         merged = merged[np.concatenate([[True], merged[1:] != merged[:-1]])] if len(merged) else merged
@@ -81,7 +81,7 @@ class SlidingWindow:
         self.predicted_sigma_m.append(predicted_sigma_m)
 
     def drop(self, index: int) -> None:
-        """Removes a keyframe. Landmarks anchored in it are re-anchored in the next keyframe that saw them."""
+        """Removes a keyframe; re-anchors its landmarks in the next keyframe that observes them."""
         anchor, gone, xy = self.anchors(), self.poses[index], self.obs[index]
         self.obs = self.obs[np.arange(len(self.poses)) != index]
         del self.poses[index], self.frames[index], self.predicted_sigma_m[index]
@@ -90,7 +90,7 @@ class SlidingWindow:
         if len(moved):
             new = self.anchors()[moved]
             R, p = self.stacked()
-            # A point at infinity stays there; one behind its new anchor becomes unknown.
+            # A point at infinity stays there; a point behind its new anchor becomes unknown
             far = self.rho[moved] <= 1e-6
             depth = 1.0 / np.where(far, 1.0, self.rho[moved])
             X = (np.column_stack([xy[moved], np.ones(len(moved))]) * depth[:, None]) @ gone.R.T + gone.p
@@ -100,7 +100,7 @@ class SlidingWindow:
         self.rho, self.rho_sigma = self.rho[seen], self.rho_sigma[seen]
 
     def rescale(self, factor: float) -> None:
-        """Multiplies all lengths, about the newest camera."""
+        """Multiplies all lengths by `factor`, about the newest camera."""
         centre = self.poses[-1].p
         self.poses = [Pose(T.R, centre + factor * (T.p - centre)) for T in self.poses]
         self.predicted_sigma_m = [factor * sigma_m for sigma_m in self.predicted_sigma_m]
@@ -108,44 +108,44 @@ class SlidingWindow:
         self.rho_sigma = self.rho_sigma / factor
 
     def predict_xy(self, pose: Pose) -> Floats:
-        """(M, 2) projections of the landmarks into a camera at `pose`; NaN where unknown or behind it."""
+        """(M, 2) projections of the landmarks into a camera at `pose`; NaN if unknown or behind the camera."""
         return self.seen_from(pose)[0][:2].T
 
-    def predict_px(self, camera: Camera, pose: Pose, ids: Ints, otherwise_px: Floats) -> Floats:
-        """(N, 2) pixels of the landmarks `ids` (N,) in a camera at `pose`; `otherwise_px` (N, 2) where not known."""
+    def predict_px(self, camera: Camera, pose: Pose, ids: Ints, default_px: Floats) -> Floats:
+        """(N, 2) pixels of the landmarks `ids` (N,) in a camera at `pose`; `default_px` (N, 2) if unknown."""
         if not len(self.ids):
-            return otherwise_px
+            return default_px
         at = np.minimum(np.searchsorted(self.ids, ids), len(self.ids) - 1)
         px = camera.to_px(self.predict_xy(pose)[at])
         known = (self.ids[at] == ids) & np.isfinite(px).all(axis=1)
-        return np.where(known[:, None], px, otherwise_px)
+        return np.where(known[:, None], px, default_px)
 
     def depths(self, pose: Pose) -> Floats:
-        """(M,) z of the landmarks in a camera at `pose`; NaN where unknown."""
+        """(M,) z of the landmarks in a camera at `pose`; NaN if unknown."""
         with np.errstate(divide="ignore", invalid="ignore"):
             z: Floats = self._seen_from(pose)[2] / self.rho
         return z
 
     def inverse_depths(self, pose: Pose) -> Floats:
-        """(M,) 1 / z of the landmarks in a camera at `pose`; NaN where unknown or behind it."""
+        """(M,) 1 / z of the landmarks in a camera at `pose`; NaN if unknown or behind the camera."""
         return self.seen_from(pose)[1]
 
-    def inverse_depths_of(self, pose: Pose, ids: Ints, otherwise: Floats) -> Floats:
-        """(N,) 1 / z of the landmarks `ids` (N,) in a camera at `pose`; `otherwise` (N,) where not known."""
+    def inverse_depths_of(self, pose: Pose, ids: Ints, default: Floats) -> Floats:
+        """(N,) 1 / z of the landmarks `ids` (N,) in a camera at `pose`; `default` (N,) if unknown."""
         if not len(self.ids):
-            return otherwise
+            return default
         at = np.minimum(np.searchsorted(self.ids, ids), len(self.ids) - 1)
         by_z = self.inverse_depths(pose)[at]
-        return np.where((self.ids[at] == ids) & np.isfinite(by_z), by_z, otherwise)
+        return np.where((self.ids[at] == ids) & np.isfinite(by_z), by_z, default)
 
     def seen_from(self, pose: Pose) -> tuple[Floats, Floats]:
-        """(3, M) the landmarks' rays (z = 1) in a camera at `pose`, (M,) 1 / z; NaN where unknown or behind it."""
+        """(3, M) rays (z = 1) and (M,) 1 / z of the landmarks in a camera at `pose`; NaN if unknown or behind it."""
         q = self._seen_from(pose)
         z = np.where(q[2] > MIN_DEPTH, q[2], np.nan)
         return q / z, self.rho / z
 
     def _seen_from(self, pose: Pose) -> Floats:
-        """(3, M) the landmarks in the axes of a camera at `pose`, times their inverse depths."""
+        """(3, M) landmarks in the axes of a camera at `pose`, times their inverse depths."""
         anchor = self.anchors()
         R, p = self.stacked()
         rays = rotate_rays(pose.R.T @ R, anchor, self.xy_of(anchor, np.arange(len(self.ids))))
@@ -153,7 +153,7 @@ class SlidingWindow:
         return out
 
     def triangulate(self) -> None:
-        """Inverse depths of landmarks seen by the newest keyframe and another, by linear least squares, poses fixed."""
+        """Triangulates the landmarks of the newest keyframe by linear least squares over all observations."""
         newest = np.isfinite(self.obs[-1, :, 0])
         anchor, xy = self.anchors()[newest], self.obs[:, newest].transpose(0, 2, 1)
         R, p = self.stacked()
@@ -161,7 +161,7 @@ class SlidingWindow:
         q0 = R_w @ rotate_rays(R, anchor, self.xy_of(anchor, np.flatnonzero(newest)))  # (F, 3, M)
         dq = (R_w @ (p.T - p[:, :, None])).take(anchor, axis=2)
         others = np.isfinite(xy[:, 0]) & (np.arange(len(p))[:, None] != anchor[None])
-        # r(rho) = (q0 + rho dq)_xy - xy (q0 + rho dq)_z is linear in rho; weights 1 / q_z make it a reprojection error
+        # r(rho) = (q0 + rho dq)_xy - xy (q0 + rho dq)_z is linear in rho; weights 1 / q_z give the reprojection error
         xy = np.where(others[:, None], xy, 0.0)
         a = dq[:, :2] - xy * dq[:, 2:]
         b = q0[:, :2] - xy * q0[:, 2:]
@@ -179,5 +179,5 @@ class SlidingWindow:
         self.rho_sigma[newest] = np.where(good, sigma, np.inf)
 
     def stacked(self) -> tuple[Floats, Floats]:
-        """The poses as arrays: (F, 3, 3) rotations, (F, 3) places."""
+        """The poses as arrays: (F, 3, 3) rotations, (F, 3) positions."""
         return np.array([T.R for T in self.poses]), np.array([T.p for T in self.poses])

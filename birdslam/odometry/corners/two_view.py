@@ -1,9 +1,7 @@
-"""The relative pose of two images: essential matrix by five points, or robust least squares from a motion prior.
+"""Relative pose of two images: essential matrix by five points, or robust least squares from a motion prior.
 
-Where most corners are far away the essential matrix confuses rotation with sideways translation, and on wrong matches
-or on a moving car RANSAC finds a consensus on a motion that no car makes. From a prior near the truth, robust least
-squares on the same epipolar residuals has one minimum. The sign of the parallax along the epipolar line rejects what
-the epipolar distance does not see: a wrong match, or a corner that moves along with the car.
+For distant corners the essential matrix confuses rotation with lateral translation; least squares from a prior does
+not. The sign of the parallax along the epipolar line rejects outliers with a small epipolar distance.
 """
 
 from __future__ import annotations
@@ -17,24 +15,21 @@ from birdslam.geometry.pose import Pose, rotation_exp
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-# 1-sigma of the prior. Rotation: the cell of the search (initialisation.py) and the car's roll. Direction of travel:
-# the mount's yaw and pitch, and the side slip of a camera in front of the rear axle
-_SIGMA_ROTATION_RAD = 0.02
-_SIGMA_DIRECTION_RAD = 0.07
-# Of the robust kernel, one an iteration: from wide to narrow
+_SIGMA_ROTATION_RAD = 0.02  # prior: the resolution of the search (initialisation.py) and the car's roll
+_SIGMA_DIRECTION_RAD = 0.07  # prior: the mount's yaw and pitch, and the lateral motion in front of the rear axle
+# Of the robust kernel, one per iteration
 _KERNEL_WIDTHS_PX = (4.0, 3.0, 2.0, 1.5, 1.0, 1.0, 0.7, 0.7, 0.7, 0.7)
 _STEP_RAD = 1e-5  # of the numerical derivative
-# The forward part of a unit translation: 0.95 in a bend of 5 m radius, 1.7 m in front of the rear axle. Five points
-# found 0.68 on a ramp with one tree and guard rails (tests/roads/ramp_21_glare)
-_MIN_FORWARD = 0.87
+# Forward part of a unit translation; 0.95 in a bend of 5 m radius, 1.7 m in front of the rear axle
+_MIN_FORWARD_RATIO = 0.87
 
 
 def initial_two_view(
     xy_a: Floats, xy_b: Floats, guess: Pose, focal_px: float, threshold_px: float
 ) -> tuple[Pose, Bools] | None:
-    """T_a_b (unit translation) and the inliers among the N pairs: from the prior, or by five points.
+    """T_a_b (unit translation) and the inliers among the N pairs, from the prior or by five points.
 
-    Five points are preferred only where they have a tenth more inliers and their motion is mostly forward.
+    Prefers five points only if they have 10 % more inliers and a mostly forward motion.
     """
     from_prior = two_view_from_prior(xy_a, xy_b, guess, focal_px, threshold_px)
     five_point = five_point_pose(xy_a, xy_b, focal_px, threshold_px)
@@ -46,7 +41,7 @@ def initial_two_view(
         )
     if from_prior is None or five_point is None:
         return five_point if from_prior is None else from_prior
-    sideways = abs(float(five_point[0].p[2])) < _MIN_FORWARD
+    sideways = abs(float(five_point[0].p[2])) < _MIN_FORWARD_RATIO
     return from_prior if sideways or from_prior[1].sum() > 0.9 * five_point[1].sum() else five_point
 
 
@@ -55,7 +50,7 @@ def two_view_from_prior(
 ) -> tuple[Pose, Bools] | None:
     """T_a_b (unit translation) near `guess` and the inliers among the N pairs, by iteratively reweighted least squares.
 
-    xy_a, xy_b (N, 2) are normalised coordinates. None where the guess has no translation, or there is no inlier.
+    xy_a, xy_b (N, 2) are normalised coordinates. None if the guess has no translation or there is no inlier.
     """
     length = float(np.linalg.norm(guess.p))
     if len(xy_a) < 12 or length < 1e-6:
@@ -86,7 +81,7 @@ def two_view_from_prior(
 def five_point_pose(xy_a: Floats, xy_b: Floats, focal_px: float, threshold_px: float) -> tuple[Pose, Bools] | None:
     """T_a_b (unit translation) and the inliers, by 5-point RANSAC on normalised coordinates (N, 2).
 
-    None where the two views do not determine it.
+    None if the two views do not determine it.
     """
     if len(xy_a) < 12:
         return None
@@ -94,7 +89,7 @@ def five_point_pose(xy_a: Floats, xy_b: Floats, focal_px: float, threshold_px: f
     E, mask = cv2.findEssentialMat(xy_a, xy_b, np.eye(3), cv2.USAC_MAGSAC, 0.999, threshold_px / focal_px, 500)
     if E is None or E.shape != (3, 3) or mask is None:
         return None
-    # Depths are unbounded: by default recoverPose rejects what is farther than 50 baselines.
+    # By default recoverPose rejects points beyond 50 baselines
     count, R, t, _, _ = cv2.recoverPose(E, xy_a, xy_b, cameraMatrix=np.eye(3), distanceThresh=1e5, mask=mask.copy())
     if count < 5:
         return None
@@ -119,7 +114,7 @@ def _pose(x: Floats, guess: Pose, axes: Floats) -> Pose:
 
 
 def _residuals(T_a_b: Pose, rays_a: Floats, rays_b: Floats, focal_px: float) -> Floats:
-    """(N,) px: Sampson distance of each pair."""
+    """(N,) px: Sampson distances."""
     tx, ty, tz = T_a_b.p
     E = np.array([[0.0, -tz, ty], [tz, 0.0, -tx], [-ty, tx, 0.0]]) @ T_a_b.R
     line_a, line_b = rays_b @ E.T, rays_a @ E
@@ -129,8 +124,7 @@ def _residuals(T_a_b: Pose, rays_a: Floats, rays_b: Floats, focal_px: float) -> 
 
 
 def _parallax_px(T_a_b: Pose, rays_a: Floats, rays_b: Floats, focal_px: float) -> Floats:
-    """(N,) px: displacement of each corner from its point at infinity, positive along its epipolar line towards nearer
-    depths."""
+    """(N,) px: parallax of each corner along its epipolar line, positive for positive depths."""
     turned = rays_a @ T_a_b.R
     at_infinity = turned[:, :2] / np.maximum(turned[:, 2:], 1e-3)
     p_b_a = -(T_a_b.R.T @ T_a_b.p)

@@ -1,10 +1,8 @@
-"""Fixed corners: those that do not move in the image while the car drives (dirt, drops, reflections, the bonnet).
+"""Fixed corners: corners that do not move in the image of a moving car (dirt, drops, reflections, the bonnet).
 
-They agree perfectly with one another on no motion, and soon outvote the street. Below the horizon a corner of it
-must move at least as far as the road behind it, which the travelled distance gives. Above it dirt looks like what is
-far: there fixed corners are left out where enough below it are fixed. At a start that distance is not known, and a way
-by corners on drops fits no length of the road: where the street's corners below the horizon have moved far, those of
-all that stood are fixed.
+They are consistent with zero motion and would outvote the street. Below the horizon a static corner moves at least as
+far as the road behind it. Above the horizon, unmoved corners are excluded only if enough below it are fixed. While the
+scale is unknown, corners that stay while those of the street move are fixed.
 """
 
 from __future__ import annotations
@@ -26,58 +24,57 @@ Bools = NDArray[np.bool_]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
 
-# Displacement of the street below the horizon, in the median of what moves there: then what stands is not the street
-_STRETCH_PX = 6.0
+# Median displacement of the moving corners below the horizon at which unmoved corners are not of the street
+_MIN_STREET_FLOW_PX = 6.0
 
 
 class FixedCornersConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """When a corner is fixed, and how many make a dirty windscreen. By judgement, tried on the shipped drive's street
-    with dirt, drops and reflections; on KITTI 00, 01, 06 and 0005 no corner is left out."""
+    """Thresholds of a fixed corner and of a dirty windscreen."""
 
-    still_px: Positive = 1.0  # displacement of a corner that counts as moved
-    road_px: Positive = 15.0  # flow of the road behind a corner that is fixed
-    on_threshold: Count = 6  # fixed corners below the horizon
-    on_threshold_share: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 0.15  # and their share of those below it
-    judged_m: Positive = 2.0  # travel over which the road moves by road_px where corners count as below it
-    far_m: Positive = 120.0  # depth assumed above the horizon: most of what has corners is nearer
-    far_px: Positive = 3.0  # flow at far_m of a corner that is fixed
+    still_px: Positive = 1.0  # minimum displacement of a moved corner
+    road_px: Positive = 15.0  # minimum flow of the road behind a fixed corner
+    on_threshold: Count = 6  # minimum fixed corners below the horizon, for a dirty windscreen
+    on_threshold_share: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 0.15  # and their minimum ratio
+    judged_m: Positive = 2.0  # distance over which the road below the horizon moves by road_px
+    far_m: Positive = 120.0  # assumed depth above the horizon
+    far_px: Positive = 3.0  # minimum flow at far_m of a fixed corner
 
 
-class _Stretch:
-    """The way over which the street's corners move by `_STRETCH_PX`: which others stand all along it.
+class _FlowInterval:
+    """Interval over which the street's corners move by `_MIN_STREET_FLOW_PX`, and the corners that stay meanwhile.
 
-    State: the corners at its begin, and the ids of those that stood over the last one. Reader: `FixedCorners`.
+    State: the corners at its start, and the ids of the unmoved ones of the last interval. Reader: `FixedCorners`.
     """
 
-    def __init__(self, still_px: float, least: int) -> None:
-        self._still_px, self._least = still_px, least
+    def __init__(self, still_px: float, min_count: int) -> None:
+        self._still_px, self._min_count = still_px, min_count
         self._ids: Ints = np.zeros(0, np.int64)
         self._px: Floats = np.zeros((0, 2))
-        self.stood: Ints = np.zeros(0, np.int64)
+        self.unmoved_ids: Ints = np.zeros(0, np.int64)
 
-    def begin(self, ids: Ints, px: Floats) -> None:
-        """A new one from corners ids (N,) ascending, px (N, 2)."""
+    def start(self, ids: Ints, px: Floats) -> None:
+        """Starts an interval at corners ids (N,) ascending, px (N, 2)."""
         self._ids, self._px = ids, px
 
     @property
-    def started(self) -> bool:
-        """Whether there were corners to begin with."""
+    def is_started(self) -> bool:
+        """Whether an interval was started."""
         return len(self._ids) > 0
 
     def update(self, ids: Ints, px: Floats, below: Bools) -> None:
-        """Takes the corners of the present image, as `begin`; `below` (N,) are those below the horizon."""
+        """Adds the corners of the current image, as in `start`; `below` (N,) marks those below the horizon."""
         a, b = match_ids(self._ids, ids)
         moved_px = np.hypot(*(px[b] - self._px[a]).T)
         street = below[b] & (moved_px > self._still_px)
-        if street.sum() >= self._least and quantile(moved_px[street], 0.5) > _STRETCH_PX:
-            self.stood = ids[b][moved_px < self._still_px]
-            self.begin(ids, px)
-        elif 2 * len(a) <= len(self._ids):  # most were lost, or none were there
-            self.begin(ids, px)
+        if street.sum() >= self._min_count and quantile(moved_px[street], 0.5) > _MIN_STREET_FLOW_PX:
+            self.unmoved_ids = ids[b][moved_px < self._still_px]
+            self.start(ids, px)
+        elif 2 * len(a) <= len(self._ids):  # most were lost
+            self.start(ids, px)
 
 
 class FixedCorners:
-    """State: each corner's position when it last moved, and the distance then. Reader: `CornerSelector`."""
+    """State: each corner's pixel and the distance travelled when it last moved. Reader: `CornerSelector`."""
 
     def __init__(self, camera: Camera, config: FixedCornersConfig) -> None:
         self.camera, self.config = camera, config
@@ -85,43 +82,43 @@ class FixedCorners:
         self._px: Floats = np.zeros((0, 2))
         self._since_m: Floats = np.zeros(0)
         self._path_m = 0.0
-        self._stretch = _Stretch(config.still_px, config.on_threshold)
+        self._interval = _FlowInterval(config.still_px, config.on_threshold)
         self.present = False
 
-    def begin(self, ids: Ints, px: Floats) -> None:
-        """Takes the corners of the image before the first of `update`, as it does."""
-        if not self._stretch.started:
-            self._stretch.begin(ids, px)
+    def start(self, ids: Ints, px: Floats) -> None:
+        """Adds the corners of the image before the first `update`."""
+        if not self._interval.is_started:
+            self._interval.start(ids, px)
 
-    def update(self, ids: Ints, px: Floats, ground: GroundPlane, driven_m: float | None) -> Bools:
-        """(N,) which corners of the present image are fixed; ids (N,) ascending, px (N, 2).
+    def update(self, ids: Ints, px: Floats, ground: GroundPlane, travelled_m: float | None) -> Bools:
+        """(N,) which corners of the current image are fixed; ids (N,) ascending, px (N, 2).
 
-        `driven_m` is the car's travel since the image before; None: it is not known.
+        `travelled_m` is the distance since the previous image; None: unknown.
         """
         cfg = self.config
-        self._path_m += driven_m or 0.0
+        self._path_m += travelled_m or 0.0
         at_px, at_m = px.copy(), np.full(len(ids), self._path_m)
         before, now = match_ids(self._ids, ids)
-        unmoved = np.square(px[now] - self._px[before]).sum(axis=1) < cfg.still_px**2
-        before, now = before[unmoved], now[unmoved]
+        same = np.square(px[now] - self._px[before]).sum(axis=1) < cfg.still_px**2
+        before, now = before[same], now[same]
         at_px[now], at_m[now] = self._px[before], self._since_m[before]
         self._ids, self._px, self._since_m = ids, at_px, at_m
         path_m = self._path_m - at_m
         fixed = self._road_flow_px(px, ground, path_m) > cfg.road_px
         below = self._road_flow_px(px, ground, np.full(len(px), cfg.judged_m)) > cfg.road_px
-        self._stretch.update(ids, px, below)
-        stood = np.isin(ids, self._stretch.stood) & (driven_m is None)
-        fixed |= stood & below
+        self._interval.update(ids, px, below)
+        unmoved = np.isin(ids, self._interval.unmoved_ids) & (travelled_m is None)
+        fixed |= unmoved & below
         limit = max(cfg.on_threshold, cfg.on_threshold_share * int(below.sum())) * (0.5 if self.present else 1.0)
         self.present = int(fixed.sum()) >= limit
         if self.present:
-            fixed |= stood | (self._road_flow_px(px, ground, path_m, 1.0 / cfg.far_m) > cfg.far_px)
+            fixed |= unmoved | (self._road_flow_px(px, ground, path_m, 1.0 / cfg.far_m) > cfg.far_px)
         return fixed
 
     def _road_flow_px(self, px: Floats, ground: GroundPlane, path_m: Floats, min_inverse_depth: float = 0.0) -> Floats:
         """(N,) optical flow of the road at pixels (N, 2) over distances (N,) straight ahead.
 
-        Above the horizon, that of a point at depth `1 / min_inverse_depth` (m).
+        Above the horizon it is that of a point at depth `1 / min_inverse_depth` (m).
         """
         cam = self.camera
         rays = rays_cam(cam, px)

@@ -1,11 +1,8 @@
-"""Fixed-pattern mask: a pattern in the road's image that does not move while the car drives (reflection, dirt, bonnet).
+"""Fixed-pattern correction: removes a pattern that is fixed in the image (reflection, dirt, bonnet) from the road.
 
-It correlates perfectly at standstill and outweighs the road on smooth asphalt. It shows as correlation of equal pixels
-of two images between which the car has driven. Lane lines do correlate too, so the past image, warped by the car's
-motion, is first projected out of it. Where there is a pattern, the running mean of the images, which holds the pattern
-and no moving road, is subtracted from each (fixed-pattern correction), without contrast normalisation: paint counts
-then, and not the noise around it. The mean is over metres: one over a few images holds the road that is compared, and
-at each rate elsewhere. docs/method.md has the correlations and what that cost.
+A pattern correlates at equal pixels of two images of a moving car, after projecting out the past image warped by the
+motion (lane lines correlate too). If there is one, the running mean of the images is subtracted, without contrast
+normalisation, which would amplify noise. The mean is over distance, so that it is independent of the frame rate.
 """
 
 from __future__ import annotations
@@ -24,33 +21,33 @@ Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 
 
 class FixedPatternConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """When there is a fixed pattern; the thresholds lie between the correlations of docs/method.md."""
+    """Thresholds of the fixed pattern."""
 
-    on_threshold: Positive = 0.32  # correlation of equal pixels, above which there is a pattern
-    off_threshold: Positive = 0.22  # correlation below which there is none any more
-    min_baseline_m: Positive = 0.5  # driven between the two images
-    memory_m: Positive = 20.0  # driven, over which the mean goes: as much as an image shows of the road
+    on_threshold: Positive = 0.32  # correlation of equal pixels above which a pattern appears
+    off_threshold: Positive = 0.22  # correlation below which a pattern disappears
+    min_baseline_m: Positive = 0.5  # minimum distance between the two images
+    memory_m: Positive = 20.0  # averaging distance: the length of road that an image shows
     judged_images: Annotated[int, msgspec.Meta(ge=1)] = 5  # time constant of the correlation's mean
-    # Judged to be without a pattern, until one that is found must have come: one that was there is found in six
+    # Images without a pattern after which a detected pattern is new, so that the mean restarts
     absent_images: Annotated[int, msgspec.Meta(ge=1)] = 10
 
 
 class FixedPattern:
-    """State: the mean images and the mean correlation. Reader: `RoadScale`, for the images that it aligns."""
+    """State: the mean images and the mean correlation. Reader: `RoadScale`, which corrects the images it aligns."""
 
     def __init__(self, config: FixedPatternConfig) -> None:
         self.config = config
         self._mean: Grey | None = None
         self._recent: Grey | None = None
-        self._images = 0  # that the mean is of, at most
-        self._absent = 0  # images in a row that were judged to have no pattern
+        self._images = 0  # image count of the mean
+        self._absent_images = 0  # consecutive images without a pattern
         self._correlation = 0.0
         self.present = False
 
     def update_mean(self, grey: NDArray[np.uint8], top_px: int, travelled_m: float) -> None:
-        """Takes (H, W) grey into the mean, rows from `top_px` on, `travelled_m` after the image before.
+        """Adds an image (H, W), rows from `top_px`, `travelled_m` after the previous one, to the mean.
 
-        All of the first images count alike, at any rate and while the scale may be far too small.
+        The first images have equal weights, since the scale may still be wrong.
         """
         cfg, rows = self.config, grey[top_px:]
         if self._mean is None or self._recent is None:
@@ -61,7 +58,7 @@ class FixedPattern:
         cv2.accumulateWeighted(rows, self._recent, 1.0 / cfg.judged_images)
 
     def subtract(self, grey: NDArray[np.uint8], top_px: int) -> NDArray[np.float32]:
-        """The rows from `top_px` on without the fixed pattern, smoothed as a RoadImage is."""
+        """The rows from `top_px` without the fixed pattern, smoothed as in RoadImage."""
         assert self._mean is not None
         difference = cv2.subtract(grey[top_px:], self._mean, dtype=cv2.CV_32F)
         return np.asarray(cv2.GaussianBlur(difference, (5, 5), 1.0), np.float32)
@@ -74,10 +71,10 @@ class FixedPattern:
         baseline_m: float,
         warp_past: Callable[[], tuple[NDArray[np.float64], NDArray[np.bool_]]] | None = None,
     ) -> bool:
-        """Correlates equal pixels (N, 2) of two images; returns whether `self.present` has changed.
+        """Correlates equal pixels (N, 2) of two images; returns whether `present` has changed.
 
-        `warp_past` gives the past image's grey values (N,), warped to these pixels by the car's motion, and which of
-        them it shows; None where the length of that motion is not known.
+        `warp_past` returns the past image's grey values (N,) warped to these pixels by the car's motion, and which of
+        them are visible; None if the length of the motion is unknown.
         """
         cfg = self.config
         if baseline_m < cfg.min_baseline_m or len(px) < 2:
@@ -88,16 +85,16 @@ class FixedPattern:
             warped, seen = warp_past()
             correlation = _correlation(_orthogonal_part(a[seen], warped[seen]), b[seen]) if seen.sum() > 1 else 0.0
         self._correlation += (correlation - self._correlation) / cfg.judged_images
-        before = self.present
-        self.present = self._correlation > (cfg.off_threshold if before else cfg.on_threshold)
-        if self.present and self._absent >= cfg.absent_images and self._recent is not None:
+        was_present = self.present
+        self.present = self._correlation > (cfg.off_threshold if was_present else cfg.on_threshold)
+        if self.present and self._absent_images >= cfg.absent_images and self._recent is not None:
             self._mean, self._images = self._recent.copy(), cfg.judged_images
-        self._absent = 0 if self.present else self._absent + 1
-        return self.present != before
+        self._absent_images = 0 if self.present else self._absent_images + 1
+        return self.present != was_present
 
 
 def _orthogonal_part(a: NDArray[np.float64], part: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(N,) a less its projection on `part`, both about their means."""
+    """(N,) `a` minus its projection on `part`, both about their means."""
     a, part = a - a.mean(), part - part.mean()
     out: NDArray[np.float64] = a - part * (float(a @ part) / max(float(part @ part), 1e-9))
     return out

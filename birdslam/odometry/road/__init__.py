@@ -1,4 +1,4 @@
-"""The metric scale from the road: direct alignment of two images, and a Kalman filter of scale, tilt and curvature.
+"""Metric scale from the road: direct alignment of image pairs, and a Kalman filter of scale, tilt and curvature.
 
-Read `scale` first (what happens with an image), then `alignment` (one pair of images) and `kalman_filter` (all pairs).
+Read `scale` first (processing of one image), then `alignment` (one pair of images) and `kalman_filter`.
 """

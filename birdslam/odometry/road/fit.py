@@ -1,11 +1,8 @@
 """The alignment's estimate without its prior, by instrumental variables, and its covariance.
 
-Image noise in the gradients biases least squares towards the prior and makes it overconfident (errors in variables). So
-each image's gradients are the instruments of the other's, whose noise is independent:
-
-    shared = sum w s past present^T    noise = sum w s^2 mean mean^T    x - shared^-1 sum w s mean r    (mean of both)
-
-past, present: a pixel's derivatives by either image's gradients; r, w: residual and weight; s: `shared_gradient`.
+Image noise in the gradients biases least squares (errors in variables). So each image's gradients are the instruments
+of the other's: shared = sum w s past present^T, noise = sum w s^2 mean mean^T, x - shared^-1 sum w s mean r.
+past, present: derivatives by either image's gradients; r, w: residual and weight; s: `shared_gradient`.
 """
 
 from __future__ import annotations
@@ -19,15 +16,13 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 ROAD = 4  # states: log lambda, pitch, roll, curvature
-MOTION = 5  # errors of the odometry's motion: rotation (3), direction of travel to the right and down (2)
+MOTION = 5  # errors of the odometry's motion: rotation (3), direction of travel right and down (2)
 _MIN_INFORMATION = (1.0, 10.0, 10.0, 1e4)
 _MIN_BRIGHTNESS = 1e-6
-_NOTHING_SHOWN = 10.0  # 1-sigma of the log of a length that the images do not tell
-# Rows and columns over which gradients are compared; on rendered motorways, streets and nights behind windscreens and
-# an encoder, six images each, (10, 20) and (26, 52) fail as few
-_CELL_PX = (16, 32)
-_MIN_SHARED_GRADIENT = 0.02  # of a cell, so that no fit is without pixels
-_MIN_SHARED_INFORMATION = 0.35  # of the information in any direction: less is not significant with so few pixels
+_UNOBSERVED_SIGMA_LOG = 10.0  # 1-sigma of the log of an unobserved length
+_CELL_PX = (16, 32)  # rows and columns over which gradients are compared
+_MIN_SHARED_GRADIENT = 0.02  # of a cell, so that every fit has pixels
+_MIN_SHARED_INFORMATION = 0.35  # minimum ratio to the information without noise, in any direction
 
 
 @dataclass(frozen=True)
@@ -38,20 +33,22 @@ class RoadFit:
     cov: Floats
     correlation: float
     samples: int
-    length_information: float = np.inf  # about the log length, by how the images compare over lengths; 0: not at all
+    length_information: float = np.inf  # about the log length, by likelihoods over lengths; 0: none
 
-    def limited(self, information: float) -> RoadFit:
-        """With no more information about the log length, given the tilt and the curvature, than this."""
-        lacks = 1.0 / max(information, _NOTHING_SHOWN**-2) - 1.0 / float(np.linalg.inv(self.cov)[0, 0])
+    def with_max_information(self, information: float) -> RoadFit:
+        """The fit with at most this information about the log length, given tilt and curvature."""
+        missing = 1.0 / max(information, _UNOBSERVED_SIGMA_LOG**-2) - 1.0 / float(np.linalg.inv(self.cov)[0, 0])
         cov = self.cov.copy()
-        cov[0, 0] += max(lacks, 0.0)
+        cov[0, 0] += max(missing, 0.0)
         return replace(self, cov=cov)
 
 
 @dataclass(frozen=True)
 class Gradients:
-    """One image's gradients at the samples, along the past camera's axes x and y (N,) each, and by them the residual's
-    derivative (11, N) by (log lambda, pitch, roll, curvature, errors of the motion, bias, gain)."""
+    """One image's gradients at the samples along the past camera's axes x and y, (N,) each.
+
+    `derivative` (11, N) is the residual's by (log lambda, pitch, roll, curvature, errors of the motion, bias, gain).
+    """
 
     x: Floats
     y: Floats
@@ -63,8 +60,8 @@ def fit_without_prior(
 ) -> tuple[Floats, Floats]:
     """The state (4,) by the images alone and its covariance (4, 4), given the state `x` (9,) of the fit with a prior.
 
-    `px` (N, 2), `residual` (N,) and `weights` (N,) are the samples'; `motion_info` (5, 5) is the prior information of
-    the motion's errors. A direction that the images do not show gets a variance far above that of roads.
+    `px` (N, 2), `residual` (N,) and `weights` (N,) are of the samples; `motion_info` (5, 5) is the prior information of
+    the motion's errors. An unobserved direction gets a variance far above that of roads.
     """
     share = shared_gradient(px, past, present)
     mean = 0.5 * (past.derivative + present.derivative)
@@ -78,15 +75,14 @@ def fit_without_prior(
         information[np.diag_indices(ROAD)] += _MIN_INFORMATION
         information[range(-2, 0), range(-2, 0)] += _MIN_BRIGHTNESS
     gradient[motion] += motion_info @ x[motion]
-    inverse = np.linalg.inv(_floored(_MIN_SHARED_INFORMATION, shared, noise))
+    inverse = np.linalg.inv(_limit_from_below(_MIN_SHARED_INFORMATION, shared, noise))
     state: Floats = x[:ROAD] - (inverse @ gradient)[:ROAD]
     cov: Floats = (inverse @ noise @ inverse)[:ROAD, :ROAD]
     return state, 0.5 * (cov + cov.T)
 
 
 def shared_gradient(px: Ints, past: Gradients, present: Gradients) -> Floats:
-    """(N,) the share of the gradients about each sample that both images have, 0 to 1: of painted lines all of it, of
-    grain that a video encoder removed none."""
+    """(N,) fraction of the gradient around each sample that both images share, from 0 (noise) to 1 (lane paint)."""
     row, column = px[:, 1] // _CELL_PX[0], px[:, 0] // _CELL_PX[1]
     cell = row * (int(column.max()) + 1) + column
     both = np.bincount(cell, past.x * present.x + past.y * present.y)
@@ -95,8 +91,8 @@ def shared_gradient(px: Ints, past: Gradients, present: Gradients) -> Floats:
     return out
 
 
-def _floored(share: float, information: Floats, noise: Floats) -> Floats:
-    """The information (n, n), floored in each direction to a share of that without noise."""
+def _limit_from_below(share: float, information: Floats, noise: Floats) -> Floats:
+    """The information (n, n), at least `share` times `noise` in each direction."""
     L = np.linalg.cholesky(noise)
     by_L = np.linalg.inv(L)
     shares, axes = np.linalg.eigh(by_L @ information @ by_L.T)

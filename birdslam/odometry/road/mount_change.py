@@ -1,10 +1,8 @@
-"""Mount-change detection: whether the camera still has the tilt of its calibration, by change-point Kalman filters.
+"""Mount-change detection: whether the camera still has its calibrated tilt, by change-point Kalman filters.
 
-A tilt sample over a few metres is the mount's tilt plus a wander (crown, grade, load, braking) that is correlated over
-tens of metres, an Ornstein-Uhlenbeck process. A Kalman filter for each of pitch and roll has both as states. A knock is
-a change point (Bayesian online change-point detection, Adams and MacKay 2007): with each sample a further hypothesis
-starts with a knock there, and wins once its likelihood exceeds that of no knock by more than knocks are rare. A mount
-that was never as in the file shows in the mount's estimate.
+A tilt sample is the mount's tilt plus a wander (crown, grade, load, braking), an Ornstein-Uhlenbeck process; both are
+Kalman states of pitch and of roll. A knock is a change point (Bayesian online change-point detection, Adams and MacKay
+2007): each sample starts a hypothesis with a knock, which wins by its posterior odds.
 """
 
 from __future__ import annotations
@@ -26,32 +24,30 @@ MOUNT, WANDER = range(2)
 
 
 class MountChangeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How far cameras tilt in their cars, and cars on real roads."""
+    """Parameters of the tilt of mounts and of cars on roads."""
 
-    sample_m: Positive = 2.0  # travelled from one sample of the tilt to the next
-    sigma_sample_rad: Positive = 0.003  # of one sample: bounces, and errors of the filter
-    wander_m: Positive = 40.0  # the wander's correlation length
-    sigma_wander_pitch_rad: Positive = 0.005  # grade and load
-    sigma_wander_roll_rad: Positive = 0.012  # grade, load and the road's crown
-    mount_walk_rad_per_sqrt_m: Positive = 2e-5  # drift of the mount
-    sigma_knock_rad: Positive = 0.05  # of the camera's turn by a knock
-    knock_odds: Positive = 1e-5  # prior odds of a knock at one sample
-    gate_sigma: Positive = 3.5  # a sample farther from its prediction is an outlier (a pothole)
+    sample_m: Positive = 2.0  # distance between two samples of the tilt
+    sigma_sample_rad: Positive = 0.003  # 1-sigma of a sample: bounces and filter errors
+    wander_m: Positive = 40.0  # correlation length of the wander
+    sigma_wander_pitch_rad: Positive = 0.005  # 1-sigma of the wander: grade and load
+    sigma_wander_roll_rad: Positive = 0.012  # 1-sigma of the wander: grade, load and the road's crown
+    mount_walk_rad_per_sqrt_m: Positive = 2e-5  # random walk of the mount
+    sigma_knock_rad: Positive = 0.05  # 1-sigma of the rotation by a knock
+    knock_odds: Positive = 1e-5  # prior odds of a knock per sample
+    gate_sigma: Positive = 3.5  # outlier gate of a sample (a pothole)
     max_hypotheses: Annotated[int, msgspec.Meta(ge=2)] = (
-        24  # samples within which a change point is confirmed or dropped
+        24  # number of samples within which a change point is confirmed or dropped
     )
-    # A mount that is off by more is reported as calibration_drift: 2.2 degrees where the file's sigma is 0.86. None of
-    # KITTI 00, 01, 06, 0005 and the raw clip is, whose files are off by up to 1.5; of 40 simulated drives of 1.5 km one
-    drift_sigma: Positive = 2.5  # that many sigma
+    drift_sigma: Positive = 2.5  # significance of calibration_drift, in sigmas
 
 
 class MountChangeDetector:
     """State, measurements and readers:
 
-    - State of each of K hypotheses: mount and wander (rad, against the camera file's tilt), for pitch and roll:
-      (K, AXES, 2). The first assumes no further knock, each next one a later knock.
+    - State of each of K hypotheses: mount and wander (rad, relative to the camera file), for pitch and roll:
+      (K, AXES, 2). The first assumes no knock, each next one a later knock.
     - Measurements: the tilt of `RoadFilter`, averaged over `sample_m` metres (`update`).
-    - Readers: `RoadScale`, which reports CALIBRATION_DRIFT where `drifted`.
+    - Readers: `RoadScale`, which reports CALIBRATION_DRIFT by `has_drifted`.
     """
 
     def __init__(self, camera: Camera, config: MountChangeConfig) -> None:
@@ -63,25 +59,25 @@ class MountChangeDetector:
         self._P = np.zeros((1, AXES, 2, 2))
         self._P[..., MOUNT, MOUNT] = self._calibrated_var
         self._P[..., WANDER, WANDER] = self._wander_var
-        self._log_odds = np.zeros(1)  # of each against the first
+        self._log_odds = np.zeros(1)  # relative to the first
         self._has_changed = False
         self._tilt_sum, self._averaged_m, self._skipped_m = np.zeros(AXES), 0.0, 0.0
 
     @property
     def mount(self) -> tuple[Floats, Floats]:
-        """(2,) each, rad: pitch and roll of the mount against the camera file's, and 1-sigma."""
+        """(2,) each, rad: pitch and roll of the mount relative to the camera file, and 1-sigma."""
         return self._x[0, :, MOUNT].copy(), np.sqrt(self._P[0, :, MOUNT, MOUNT])
 
     @property
-    def drifted(self) -> bool:
-        """Whether the mount is significantly off: by file's and samples' sigma, after a knock by the samples' alone."""
+    def has_drifted(self) -> bool:
+        """Whether the mount differs significantly, by the sigma of file and samples; after a knock, of the samples."""
         off, sigma = self.mount
-        # The variance of an estimate that starts at the file's tilt, if the file is right
+        # Variance of an estimate that starts at the file's tilt, if the file is correct
         var = np.square(sigma) if self._has_changed else np.maximum(self._calibrated_var - np.square(sigma), 0.0)
         return bool((np.abs(off) > self.config.drift_sigma * np.sqrt(var)).any())
 
     def update(self, tilt_rad: Floats, travelled_m: float, measured: bool) -> None:
-        """The tilt (pitch, roll) after a further `travelled_m`; it is left out where it was not `measured`."""
+        """Adds the tilt (pitch, roll) after a further `travelled_m`; skips it if it was not `measured`."""
         if not measured:
             self._skipped_m += travelled_m
             return
@@ -91,13 +87,13 @@ class MountChangeDetector:
             self._step(self._tilt_sum / self._averaged_m, self._averaged_m + self._skipped_m)
             self._tilt_sum, self._averaged_m, self._skipped_m = np.zeros(AXES), 0.0, 0.0
 
-    def _step(self, off_rad: Floats, way_m: float) -> None:
+    def _step(self, off_rad: Floats, distance_m: float) -> None:
         cfg = self.config
-        keep = math.exp(-way_m / cfg.wander_m)
+        keep = math.exp(-distance_m / cfg.wander_m)
         F = np.array([1.0, keep])
         x, P = self._x * F, self._P * np.outer(F, F)
         P[..., WANDER, WANDER] += (1.0 - keep**2) * self._wander_var
-        P[..., MOUNT, MOUNT] += cfg.mount_walk_rad_per_sqrt_m**2 * way_m
+        P[..., MOUNT, MOUNT] += cfg.mount_walk_rad_per_sqrt_m**2 * distance_m
         changed = P[:1].copy()
         changed[..., MOUNT, MOUNT] += cfg.sigma_knock_rad**2
         x, P = np.concatenate([x, x[:1]]), np.concatenate([P, changed])

@@ -45,7 +45,7 @@ class RoadObstructions:
 
     def begin(self, grey: NDArray[np.uint8]) -> None:
         """Looks for a bonnet in the first image."""
-        if not self._bonnet.initialised:
+        if not self._bonnet.is_initialised:
             self._bonnet.update(grey, self._aligner.top_px, np.inf)
 
     def frame(self, grey: NDArray[np.uint8], travelled_m: float) -> RoadFrame:

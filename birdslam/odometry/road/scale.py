@@ -259,7 +259,7 @@ class RoadScale:
             out.append(Status.GROUND_VIOLATED)
         if self._obstructions.present:
             out.append(Status.VIEW_OBSTRUCTED)
-        if self._mount_change.drifted:
+        if self._mount_change.has_drifted:
             out.append(Status.CALIBRATION_DRIFT)
         return out
 
@@ -325,7 +325,7 @@ class RoadScale:
             return 1.0
         shown = confirmation.mean_information(fit.length_information)
         if not agrees(float(np.log(searched)) + filter_.length(fit)[0], by_landmarks):
-            fit = fit.limited(min(fit.length_information, shown))
+            fit = fit.with_max_information(min(fit.length_information, shown))
         self.fit = fit
         filter_.cov = prior_cov
         tells = filter_.information(fit)
