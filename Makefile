@@ -52,9 +52,9 @@ browser:
 test: browser setup
 	@$(BIN)/python -m tests.run
 
-# The tests that compute under the kernels of other processors, or VARIANT="NAME ..."; perf/accuracy/cpus.py lists them
+# The tests that compute under the kernels of other processors, or VARIANT="NAME,..."; perf/accuracy/cpus.py lists them
 test-cpus: setup
-	@$(BIN)/python -m tests.run --cpus $(VARIANT)
+	@$(BIN)/python -m tests.run --cpus "$(VARIANT)"
 
 # Of that a sample, for CI
 test-cpus-sample: setup
@@ -102,9 +102,9 @@ $(DIST_VENV)/.ready: pyproject.toml
 fuzz: setup
 	$(BIN)/python -m tests.fuzz --cases 1000000 --seed $(or $(FUZZ_SEED),6)
 
-# Every fault on a running vehicle: docs/faults.md
+# Every fault on a running vehicle: out/faults.md
 faults: setup
-	$(BIN)/python -m perf faults --markdown docs/faults.md
+	$(BIN)/python -m perf faults --markdown out/faults.md
 
 # The budgets of the running system, on a machine that does nothing else
 onroad: setup

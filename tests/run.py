@@ -1,7 +1,7 @@
 """`make test`: the tests that compute, then those that start processes, and one line that sums up both.
 
 python -m tests.run                       # both parts; the second runs where the first has failed, too
-python -m tests.run --cpus [NAME ...]     # the tests that compute, under the kernels of other processors: a table
+python -m tests.run --cpus [NAME,...]     # the tests that compute, under the kernels of other processors: a table
 python -m tests.run --sample              # of that two variants and the tests marked `numeric`: .ci/run
 """
 
@@ -27,7 +27,8 @@ from birdslam.perf.accuracy.cpus import VARIANTS
 ON_EACH_CHANGE = "not slow and not faults and not onroad"
 COMPUTING = f"not processes and {ON_EACH_CHANGE}"
 SAMPLE = ("Nehalem", "perturbed tracks 1")
-PERTURBED = {f"perturbed tracks {seed}": {"BIRDSLAM_ROUNDING": str(seed)} for seed in range(1, 4)}
+PERTURBED: dict[str, dict[str, str]] = {f"perturbed tracks {seed}": {"BIRDSLAM_ROUNDING": str(seed)} for seed in range(1, 4)}
+ALL_VARIANTS = {**VARIANTS, **PERTURBED}
 NO_TESTS = 5  # pytest's exit status
 
 
@@ -74,7 +75,7 @@ def pytest(marks: str, jobs: int, environment: Mapping[str, str], arguments: Seq
 
 
 def kernels() -> str:
-    """Which kernels the libraries have tuned on this processor."""
+    """Which kernels the libraries use on this processor."""
     name = "unknown"
     for library in sorted((Path(np.__file__).parents[1] / "numpy.libs").glob("libscipy_openblas*")):
         function = getattr(ctypes.CDLL(str(library)), "scipy_openblas_get_corename64_", None)
@@ -86,10 +87,10 @@ def kernels() -> str:
 
 def under_variants(names: Sequence[str], marks: str) -> int:
     """Prints a table of the variants; 1 where a test fails under any."""
-    known, rows, cores = {**VARIANTS, **PERTURBED}, [], os.cpu_count() or 2
+    rows, cores = [], os.cpu_count() or 2
     for name in names:
         print(f"== {name}", flush=True)
-        rows.append((name, pytest(marks, cores, known[name])))
+        rows.append((name, pytest(marks, cores, ALL_VARIANTS[name])))
     print("\n| variant | passed | failed | seconds |\n|---|---|---|---|")
     for name, result in rows:
         print(f"| {name} | {result.passed} | {result.failed} | {result.seconds:.0f} |")
@@ -98,13 +99,16 @@ def under_variants(names: Sequence[str], marks: str) -> int:
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.run")
-    parser.add_argument("--cpus", nargs="*", metavar="NAME", help="variants; without a name all of them")
+    parser.add_argument("--cpus", nargs="?", const="", metavar="NAMES", help="variants with commas between them; none: all")
     parser.add_argument("--sample", action="store_true", help="two variants, and the tests marked `numeric`")
     options = parser.parse_args()
     if options.sample:
         return under_variants(SAMPLE, f"numeric and {COMPUTING}")
     if options.cpus is not None:
-        return under_variants(options.cpus or [*VARIANTS, *PERTURBED], COMPUTING)
+        names = [name.strip() for name in options.cpus.split(",") if name.strip()] or list(ALL_VARIANTS)
+        if unknown := [name for name in names if name not in ALL_VARIANTS]:
+            parser.error(f"there is no variant {unknown[0]!r}; expected one of {', '.join(ALL_VARIANTS)}")
+        return under_variants(names, COMPUTING)
     print(f"kernels: {kernels()}", flush=True)
     computing = pytest(COMPUTING, os.cpu_count() or 2, {})
     processes = pytest(f"processes and {ON_EACH_CHANGE}", 3, {})

@@ -248,6 +248,22 @@ def test_lossless_messages_all_arrive_at_a_slow_reader(join: Any) -> None:
     assert frames.dropped == 0
 
 
+def test_a_record_that_must_arrive_waits_for_a_full_link(join: Any) -> None:
+    frames = join("perceive", hub=True).subscriber("frame", depth=1)
+    out = join("capture").publisher("frame")
+    assert out.wait_matched(LIMIT_S)
+    count = 2_000  # twice what the socket and the queue before it take
+    last = threading.Thread(target=out.put, args=(frame_ref(count),), kwargs={"must_arrive": True})
+    with frames._arrived:  # private: the reader's thread can't go on
+        for frame_id in range(count):
+            out.put(frame_ref(frame_id))
+        last.start()
+        last.join(0.1)
+    until(lambda: frames.newest and frames.newest.record.frame_id == count, "the last record")
+    last.join(LIMIT_S)
+    assert frames.dropped > 0
+
+
 def test_a_lossless_queue_that_overflows_says_so(join: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("birdslam.runtime.transport.bus.LOSSLESS_DEPTH", 4)
     hub = join("supervisor", hub=True, lossless=True)

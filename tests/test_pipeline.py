@@ -482,7 +482,8 @@ def test_degraded_modes_are_reported_and_no_wrong_pose_is_valid(drive: Path, pla
             assert [stage.node for stage in message.trace.stages] == ["capture", "perceive", "optimize"]
             seen.append(message.record)
         assert not seen[-1].valid
-        assert seen[-1].cov[0] > seen[-2].cov[0]
+        before, after = (np.linalg.det(np.reshape(e.cov, (3, 3))) for e in seen[-2:])
+        assert after > before  # the axes turn with the car: no single variance has to grow
         assert all(e.valid == INVALIDATING.isdisjoint(e.status) for e in seen)
         reading = planner.latest(max_age_ms=1e9)
         assert reading.left_ms is not None

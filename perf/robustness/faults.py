@@ -102,14 +102,14 @@ def measure(vehicle: Vehicle, fault: Fault) -> Row:
 
 
 def page(rows: list[Row]) -> str:
-    """docs/faults.md: the table with its head."""
+    """A page: the table with its head."""
     m = describe()
     machine = f"Measured {m['utc']} on {m['cpu']}, {m['cores']} cores, {m['kernel']}, at commit {m['commit']}."
     return PAGE.format(faults=len(rows), machine=machine, table=markdown(rows))
 
 
 def markdown(rows: list[Row]) -> str:
-    """The table of docs/faults.md."""
+    """The table of such a page."""
     lines = [
         "| fault | hits | valid again after | what the planner saw meanwhile "
         "| valid poses off by | wrong poses | wrongly valid |",

@@ -115,7 +115,12 @@ def _await_downstream(name: str, bus: Bus, publishers: dict[type, Publisher], ti
 
 
 def _is_frame(record: msgspec.Struct) -> TypeGuard[FrameRef | Measurements | Estimate]:
-    return isinstance(record, FrameRef | Measurements | Estimate) and Status.END_OF_SOURCE not in record.status
+    return isinstance(record, FrameRef | Measurements | Estimate) and not _ends(record)
+
+
+def _ends(record: msgspec.Struct) -> bool:
+    """Whether the record ends the run: without it, everybody behind would wait for more."""
+    return isinstance(record, FrameRef | Measurements | Estimate) and Status.END_OF_SOURCE in record.status
 
 
 def _loop(
@@ -152,7 +157,7 @@ def _loop(
                         meter.frame(record.t_capture_ns, trace)
                     if isinstance(record, Estimate):
                         trace = msgspec.structs.replace(trace, left_ns=record.t_capture_ns + budget_ns - now_ns)
-                publishers[type(record)].put(record, trace)
+                publishers[type(record)].put(record, trace, must_arrive=node.ended or _ends(record))
         vitals.count(frames=meter.frames, ended=node.ended, **node.counters())
         if meter.due(now_ns):
             publishers[Health].put(meter.health(now_ns, node.mode, node.counters()))

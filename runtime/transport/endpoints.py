@@ -77,6 +77,8 @@ class Publisher:
         self, session: zenoh.Session, key: str, topic: Topic, node: str, lossless: bool, express: bool = True
     ) -> None:
         self._topic, self._node = topic, node
+        self._session, self._key, self._express = session, key, express
+        self._priority = zenoh.Priority.REAL_TIME if topic.urgent else zenoh.Priority.DATA_LOW
         self._changed = threading.Condition()
         self._closed = False
         self._sent = 0
@@ -84,7 +86,7 @@ class Publisher:
         self._publisher = session.declare_publisher(
             key,
             congestion_control=zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP,
-            priority=zenoh.Priority.REAL_TIME if topic.urgent else zenoh.Priority.DATA_LOW,
+            priority=self._priority,
             express=express,
         )
         self._retained = RetainedMessages(session, key, topic.retained) if topic.retained else None
@@ -113,10 +115,11 @@ class Publisher:
             raise BusClosed(f"{self._topic.name}: the bus is closed")
         return matched
 
-    def put(self, record: msgspec.Struct, trace: Trace | None = None) -> None:
+    def put(self, record: msgspec.Struct, trace: Trace | None = None, must_arrive: bool = False) -> None:
         """Sends a record, and stamps its sending into the last stage of `trace` (None: it begins here and now).
 
-        A reader that is too slow costs messages, not time: the lossy bus waits 1 ms at the most for a full link.
+        A reader that is too slow costs messages, not time: the lossy bus waits 1 ms at the most for a full link, and
+        drops the record. One that `must_arrive` waits until the link has room, or is given up.
         Raises WireError (a record that is too large), BusClosed, and TypeError for a record of another type.
         """
         if type(record) is not self._topic.record:
@@ -129,7 +132,17 @@ class Publisher:
         if self._retained is not None:
             self._retained.add(data, attachment)
         try:
-            self._publisher.put(data, attachment=attachment)
+            if must_arrive:  # of the same priority: it stays behind the records before it
+                self._session.put(
+                    self._key,
+                    data,
+                    attachment=attachment,
+                    congestion_control=zenoh.CongestionControl.BLOCK,
+                    priority=self._priority,
+                    express=self._express,
+                )
+            else:
+                self._publisher.put(data, attachment=attachment)
         except zenoh.ZError as error:
             if self._closed:
                 raise BusClosed(f"{self._topic.name}: the bus is closed") from error
