@@ -27,7 +27,9 @@ from birdslam.perf.accuracy.cpus import VARIANTS
 ON_EACH_CHANGE = "not slow and not faults and not onroad"
 COMPUTING = f"not processes and {ON_EACH_CHANGE}"
 SAMPLE = ("Nehalem", "perturbed tracks 1")
-PERTURBED: dict[str, dict[str, str]] = {f"perturbed tracks {seed}": {"BIRDSLAM_ROUNDING": str(seed)} for seed in range(1, 4)}
+PERTURBED: dict[str, dict[str, str]] = {
+    f"perturbed tracks {seed}": {"BIRDSLAM_ROUNDING": str(seed)} for seed in range(1, 4)
+}
 ALL_VARIANTS = {**VARIANTS, **PERTURBED}
 NO_TESTS = 5  # pytest's exit status
 
@@ -99,7 +101,9 @@ def under_variants(names: Sequence[str], marks: str) -> int:
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.run")
-    parser.add_argument("--cpus", nargs="?", const="", metavar="NAMES", help="variants with commas between them; none: all")
+    parser.add_argument(
+        "--cpus", nargs="?", const="", metavar="NAMES", help="variants with commas between them; none: all"
+    )
     parser.add_argument("--sample", action="store_true", help="two variants, and the tests marked `numeric`")
     options = parser.parse_args()
     if options.sample:

@@ -34,6 +34,7 @@ class CvEdges:
     at: Complexes  # (k,) the measured places
     heading: Complexes  # (k,)
     covs: Floats  # (k, 3, 3)
+    factors: Floats  # (k, 2, 2) of the places' covariances, by the lines of sight: lasting_error.py
 
 
 @dataclass(slots=True)

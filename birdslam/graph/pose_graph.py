@@ -23,7 +23,7 @@ from birdslam.graph.checkpoint import Checkpoint, CheckpointError, Epoch, pack, 
 from birdslam.graph.edges import PoseEdges, pose_edges
 from birdslam.graph.factors.constant_velocity import twist_growth
 from birdslam.graph.factors.factor import Factor, GraphFrame, Linearised
-from birdslam.graph.factors.lasting_error import relative_sigmas, sight_factors
+from birdslam.graph.factors.lasting_error import relative_sigmas
 from birdslam.graph.factors.standard import standard_factors
 from birdslam.graph.factors.vehicle_detection import VehicleDetections
 from birdslam.graph.graph_config import GraphConfig, check_together
@@ -259,9 +259,8 @@ class PoseGraph:
         if started:
             begins = [self._vehicles.begin(cv[k].vehicle, m.frame_id, m.t_source_ns) for k in started]
             seen = cv_edges(begins, frame.edges.cv_numbers[started])
-            factors = sight_factors(seen.at, seen.covs)
-            lasting, sigma_rel = math.sqrt(self.config.lasting_share) * factors, relative_sigmas(seen, factors)
-            window.place_vehicles(seen, self._birth_covs(seen.covs[:, 2, 2]), lasting, sigma_rel)
+            lasting = math.sqrt(self.config.lasting_share) * seen.factors
+            window.place_vehicles(seen, self._birth_covs(seen.covs[:, 2, 2]), lasting, relative_sigmas(seen))
 
     def _birth_covs(self, yaw_variances: Floats) -> Floats:
         """(k, 3, 3) of the twists of vehicles seen for the first time, at rest for all that is known.

@@ -11,6 +11,7 @@ import numpy as np
 from birdslam.geometry.arrays import Floats
 from birdslam.graph.costs import rotated
 from birdslam.graph.edges import CvEdges, PoseEdges, VvEdges
+from birdslam.graph.factors.lasting_error import sight_factors
 from birdslam.types import Moves, VehicleEdge
 
 PATH_HALF_WIDTH_M = 1.75  # half a lane, as in vehicles/state/parallax.py
@@ -56,12 +57,12 @@ class Associations:
 
 def cv_edges(rows: list[int], numbers: Floats) -> CvEdges:
     """The edges to the vehicles in these rows of the window, all in ego, from their `numbers` (k, 12)."""
-    heading = np.exp(1j * numbers[:, 2])
+    at, heading = numbers[:, 0] + 1j * numbers[:, 1], np.exp(1j * numbers[:, 2])
     covs = rotated(numbers[:, 3:].reshape(-1, 3, 3), heading)
-    return CvEdges(rows, numbers[:, 0] + 1j * numbers[:, 1], heading, covs)
+    return CvEdges(rows, at, heading, covs, sight_factors(at, covs))
 
 
-NO_CV = CvEdges([], np.zeros(0, np.complex128), np.zeros(0, np.complex128), np.zeros((0, 3, 3)))
+NO_CV = cv_edges([], np.zeros((0, 12)))
 NO_VV = VvEdges([], np.zeros(0), np.zeros(0, np.complex128), np.zeros(0), np.zeros((0, 3, 3)))
 
 

@@ -39,7 +39,7 @@ def approaches(p: Complexes, v: Complexes, covs: Floats) -> list[Approach]:
     by[1, :, 0] = at / np.maximum(distance, 1e-6)  # towards them
     by[1, :, 1] = by[1, :, 0] * time
     J = by.view(np.float64)  # (2, N, 4)
-    variances = np.einsum("qni,nij,qnj->qn", J, covs, J)
+    variances = ((J[:, :, None] @ covs)[:, :, 0] * J).sum(axis=2)
     np.sqrt(np.maximum(variances, 0.0), out=numbers[1::2])
     sigma_s *= free == time
     np.minimum(numbers, MAX_REPORTED, out=numbers)

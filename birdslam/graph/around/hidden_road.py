@@ -32,19 +32,17 @@ def hidden_fans(vehicles: Sequence[RoadUser], world: SE2, camera_m: float) -> tu
             continue
         ahead = cmath.rect(0.5 * vehicle.length_m, T.yaw_rad - world.yaw_rad)
         left = 1j * ahead * (vehicle.width_m / max(vehicle.length_m, MIN_M))
-        corners = (at + ahead + left, at - ahead + left, at - ahead - left, at + ahead - left)
-        if min(corners[0].real, corners[1].real, corners[2].real, corners[3].real) <= MIN_DISTANCE_M:
+        if at.real - abs(ahead.real) - abs(left.real) <= MIN_DISTANCE_M:  # its nearest corner
             continue
+        corners = at + ahead + left, at - ahead + left, at - ahead - left, at + ahead - left
         slopes = [c.imag / c.real for c in corners]  # in the order of the angles, since all lie ahead
         right, left = corners[slopes.index(min(slopes))], corners[slopes.index(max(slopes))]  # its outline
         right_m, left_m = abs(right), abs(left)
         over_m = camera_m - (vehicle.height_m or USUAL_HEIGHT_M)
         reach = camera_m / over_m if over_m > 0.0 else math.inf
-        beyond_right, beyond_left = (
-            right * min(reach, MAX_DISTANCE_M / right_m),
-            left * min(reach, MAX_DISTANCE_M / left_m),
-        )
-        if abs(beyond_right) > right_m + MIN_M and abs(beyond_left) > left_m + MIN_M:
+        to_right, to_left = min(reach, MAX_DISTANCE_M / right_m), min(reach, MAX_DISTANCE_M / left_m)
+        if (to_right - 1.0) * right_m > MIN_M and (to_left - 1.0) * left_m > MIN_M:
+            beyond_right, beyond_left = right * to_right, left * to_left
             x_m = right.real, beyond_right.real, beyond_left.real, left.real
             y_m = right.imag, beyond_right.imag, beyond_left.imag, left.imag
             fans.append((away_m, HiddenFan(vehicle=vehicle.vehicle, x_m=x_m, y_m=y_m)))

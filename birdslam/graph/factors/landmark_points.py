@@ -65,9 +65,9 @@ def sightings(edges: tuple[LandmarkEdge, ...]) -> Sightings:
     x, y, xx, xy, _, yy = table.T[:6]
     shared = table.T[6:8] + 1j * table.T[8:]
     out = Sightings(keys, x + 1j * y, 0.5 * (xx + yy) + _MIN_VARIANCE_M2, 0.5 * (xx - yy) + 1j * xy, shared)
-    good = out.means - 0.5 * (shared * shared.conj()).real.sum(axis=0) > np.abs(
-        out.deviators - 0.5 * (shared * shared).sum(axis=0)
-    )
+    squares = shared * shared
+    own_means = out.means - 0.5 * np.abs(squares).sum(axis=0)
+    good = own_means > np.abs(out.deviators - 0.5 * squares.sum(axis=0))
     return out if good.all() else out[np.flatnonzero(good)]
 
 

@@ -30,10 +30,10 @@ def sight_factors(at: Complexes, covs: Floats) -> Floats:
     return out
 
 
-def relative_sigmas(edges: CvEdges, factors: Floats) -> Floats:
+def relative_sigmas(edges: CvEdges) -> Floats:
     """(k, 2) 1-sigma of the edges' places along the line of sight and across it, as fractions of the distance."""
     distance_m = np.maximum(np.abs(edges.at), 1e-9)
-    out: Floats = np.sqrt(np.square(factors).sum(axis=1)) / distance_m[:, None]
+    out: Floats = np.sqrt(np.square(edges.factors).sum(axis=1)) / distance_m[:, None]
     return out
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from birdslam.graph.costs import binary_residuals
 from birdslam.graph.factors.factor import Factor, GraphFrame, Linearised
-from birdslam.graph.factors.lasting_error import DRIVING_MPS, kept, relative_sigmas, sight_factors
+from birdslam.graph.factors.lasting_error import DRIVING_MPS, kept, relative_sigmas
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.state_layout import LASTING, OF_VEHICLE, POSE
 from birdslam.graph.vehicles import SHORTEST_S
@@ -36,7 +36,7 @@ class VehicleDetections(Factor):
         """
         edges = frame.associations.cv
         if self._share and edges.rows:
-            sigma_rel = relative_sigmas(edges, sight_factors(edges.at, edges.covs))
+            sigma_rel = relative_sigmas(edges)
             ego_mps = math.hypot(frame.motion.x_m, frame.motion.y_m) / max(frame.passed_s, SHORTEST_S)
             driven_s = frame.associations.dt_s[edges.rows] * -math.expm1(-ego_mps / DRIVING_MPS)
             same = kept(sigma_rel, window.sigma_rel[edges.rows], driven_s, self._memory_s)
@@ -57,7 +57,7 @@ class VehicleDetections(Factor):
             return Linearised(residuals, OWN_POSE, edges.covs, self._gate, edges.rows)
         J, covs = np.zeros((len(edges.rows), 3, OF_VEHICLE)), edges.covs.copy()
         J[:, POSE, POSE] = np.eye(3)
-        J[:, PLACE, LASTING] = math.sqrt(self._share) * sight_factors(edges.at, edges.covs)
+        J[:, PLACE, LASTING] = math.sqrt(self._share) * edges.factors
         covs[:, PLACE] *= math.sqrt(1.0 - self._share)
         covs[:, :, PLACE] *= math.sqrt(1.0 - self._share)
         return Linearised(residuals, J, covs, self._gate, edges.rows)
