@@ -130,24 +130,47 @@ def read_tum(path: Path) -> tuple[Floats, Transform]:
     return rows[:, 0], poses
 
 
-class CameraTrajectory:
-    """Ego poses, frame by frame, to camera poses `T_first_i` in the axes of the first camera (KITTI).
+class JoinedTrajectory:
+    """The poses of all epochs in the axes of the first: a new epoch continues at the last pose.
 
-    A new epoch has a world of its own, and the motion in between is unknown: it is placed where the last one ended.
+    Each epoch has a world of its own, and the motion between two is unknown.
     """
+
+    def __init__(self, start: Transform | None = None) -> None:
+        """`start`: the first pose; None: it is that of the first epoch's world."""
+        self._start = start
+        self._epoch: int | None = None
+        self.T_first_world: Transform = np.eye(4)  # of the present epoch
+
+    @property
+    def last(self) -> Transform:
+        """The newest pose (4, 4)."""
+        return np.eye(4) if self._start is None else self._start
+
+    def add(self, epoch: int, T_world_i: Transform) -> Transform:
+        """Returns the next pose (4, 4) in the axes of the first epoch."""
+        if epoch == self._epoch:
+            self._start = self.T_first_world @ T_world_i
+        elif self._start is None:
+            self._start = T_world_i
+        else:
+            self.T_first_world = self._start @ inverse(T_world_i)
+        self._epoch = epoch
+        return self._start
+
+
+class CameraTrajectory:
+    """Ego poses, frame by frame, to camera poses in the axes of the first camera (KITTI)."""
 
     def __init__(self, mount: GroundPlane) -> None:
         self._T_ego_cam = mount_pose(mount)
-        self._T_first_world: Transform | None = None
-        self._epoch = 0
-        self.last: Transform = np.eye(4)
+        self._joined = JoinedTrajectory(start=np.eye(4))
+
+    @property
+    def last(self) -> Transform:
+        """The newest camera pose (4, 4)."""
+        return self._joined.last
 
     def add(self, epoch: int, T_world_ego: Transform) -> Transform:
-        """`T_first_i` (4, 4) of the next frame's `ego_pose`."""
-        T_world_cam = T_world_ego @ self._T_ego_cam
-        if self._T_first_world is None or epoch != self._epoch:
-            self._T_first_world = self.last @ inverse(T_world_cam)
-            self._epoch = epoch
-        else:
-            self.last = self._T_first_world @ T_world_cam
-        return self.last
+        """Returns `T_first_i` (4, 4) of the next frame's `ego_pose`."""
+        return self._joined.add(epoch, T_world_ego @ self._T_ego_cam)

@@ -23,8 +23,9 @@ from birdslam.calibration.calibration import (
     by_road,
     calibrate,
 )
+from birdslam.calibration.camera_files import read_intrinsics
 from birdslam.calibration.height_check import HeightCheck, VehicleHeightConfig, solve_mounting
-from birdslam.calibration.intrinsics import from_chessboard, read_intrinsics
+from birdslam.calibration.intrinsics import from_chessboard
 from birdslam.calibration.lane_width import LaneWidth, checks_by_lanes, painted_width_m
 from birdslam.calibration.readout import USUAL
 from birdslam.frontend import FrontEndConfig
@@ -118,9 +119,9 @@ def test_a_kitti_file(tmp_path: Path) -> None:
         ("a.yaml", ROS.replace("438.5, 0.0,", "438.5, 9.0,"), "skew"),
         ("a.yaml", ROS.replace("438.5, ", ""), "8 numbers"),
         ("a.yaml", ROS.replace("plumb_bob", "mei"), "mei is not supported"),
-        ("a.yaml", ROS.replace("image_width: 640", "image_width: wide"), "width is 'wide'"),
+        ("a.yaml", ROS.replace("image_width: 640", "image_width: wide"), "size is 'wide'"),
         ("a.yaml", ROS + "x: !!python/object/apply:sys.exit [3]\n", "no YAML"),
-        ("a.txt", "P9: 1 2 3\n", "no KITTI calibration"),
+        ("a.txt", "P9: 1 2 3\n", "none of P0, P2"),
         ("a.txt", "P2: 1 2 nan 4 5 6 7 8 9 10 11 12\n", "not finite"),
     ],
 )

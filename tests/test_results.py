@@ -150,7 +150,7 @@ def test_a_source_that_counts_anew_goes_on(tmp_path: Path) -> None:
     assert len(read_kitti(tmp_path / "ego.kitti.txt")) == 6
 
 
-def test_a_new_epoch_is_marked_and_the_rows_go_on(tmp_path: Path) -> None:
+def test_a_new_epoch_is_marked_and_the_trajectories_continue(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path, CAMERA)
     seen = (vehicle(4, SE2(12.0, 0.0, 0.0), 9),)
     for k in range(5):
@@ -162,8 +162,10 @@ def test_a_new_epoch_is_marked_and_the_rows_go_on(tmp_path: Path) -> None:
     z_m = read_kitti(tmp_path / "ego.kitti.txt")[:, 2, 3] / math.cos(0.01)
     assert z_m == pytest.approx([0, 1, 2, 3, 4, 4, 5, 6, 7, 8])
     tum = (tmp_path / "ego.tum.txt").read_text().splitlines()
-    mark = tum.index("# epoch 1: a new world frame begins")
-    assert tum[mark + 1].startswith("0.150000000 0.000000000 ")
+    mark = tum.index("# epoch 1: a new world frame begins; its poses continue at the last one")
+    assert tum[mark + 1].startswith("0.150000000 4.000000000 ")
+    _, poses = read_tum(tmp_path / "ego.tum.txt")
+    assert np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).max() == pytest.approx(1.0)  # no jump
     track = (tmp_path / "tracks" / "4.tum.txt").read_text().splitlines()
     assert track.count("# epoch 1: a new world frame begins") == 1
     assert json.loads((tmp_path / "summary.json").read_text())["path_m"] == 8.0

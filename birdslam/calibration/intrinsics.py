@@ -1,4 +1,4 @@
-"""Intrinsics from calibrations by others: KITTI files, camera_info YAML of ROS and OpenCV, chessboard images.
+"""Intrinsics of a camera without its place in the car, and their calibration by images of a chessboard.
 
 Everything here raises DatasetError with the file and the reason. `camera.Camera` checks the numbers themselves.
 """
@@ -6,27 +6,24 @@ Everything here raises DatasetError with the file and the reason. `camera.Camera
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import cv2
 import msgspec
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
-from birdslam.sources.kitti import read_image, read_projection
+from birdslam.sources.kitti import read_image
 from birdslam.sources.recording import DatasetError
 
 Floats = NDArray[np.float64]
 
-DISTORTIONS = ("plumb_bob", "rational_polynomial", "radtan", "equidistant", "")  # of ROS; OpenCV's own files name none
 FEWEST_BOARDS = 6
 MAX_REPROJECTION_PX = 1.0  # root mean square: past it something else than the lens was measured
 MAX_SIGMA_FOCAL_REL = 0.02
 MIN_TILT_DEG = 10.0  # between two of the boards: those that all stand alike leave the focal length open
-KITTI_KEYS = ("P0", "P2", "P_rect_00", "P_rect_02")
 
 
 class Intrinsics(msgspec.Struct, frozen=True, kw_only=True):
@@ -65,102 +62,6 @@ class Intrinsics(msgspec.Struct, frozen=True, kw_only=True):
             height_px=height_px,
             source=f"{self.source}, scaled from {self.width_px}x{self.height_px}",
         )
-
-
-def read_intrinsics(path: Path, key: str | None = None) -> Intrinsics:
-    """Of a calibration file: YAML (.yaml, .yml) of ROS or OpenCV, else KITTI's text with a projection matrix `key`."""
-    if path.suffix.lower() in (".yaml", ".yml"):
-        return _read_yaml(path)
-    keys = (key,) if key else KITTI_KEYS
-    reason = ""
-    for name in keys:
-        try:
-            P = read_projection(path, name)
-        except DatasetError as error:
-            if "has no" not in str(error):
-                raise
-            reason = str(error)
-            continue
-        return Intrinsics(
-            fx_px=P[0, 0], fy_px=P[1, 1], cx_px=P[0, 2], cy_px=P[1, 2], source=f"{path} ({name}, rectified)"
-        )
-    raise DatasetError(reason if key else f"{path}: has none of {', '.join(KITTI_KEYS)}: no KITTI calibration, no YAML")
-
-
-class _Loader(yaml.SafeLoader):
-    """Plain YAML, and OpenCV's matrices as mappings."""
-
-
-_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", lambda loader, node: loader.construct_mapping(node, True))
-
-
-def _read_yaml(path: Path) -> Intrinsics:
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise DatasetError(f"{path}: can't be read: {getattr(error, 'strerror', None) or 'not UTF-8'}") from None
-    if text.startswith("%YAML"):  # OpenCV writes "%YAML:1.0", which YAML does not know
-        text = text.partition("\n")[2]
-    try:
-        # the first document: `rostopic echo` ends each message by "---"
-        tree = next((document for document in yaml.load_all(text, _Loader) if document is not None), None)
-    except yaml.YAMLError as error:
-        raise DatasetError(f"{path}: no YAML: {' '.join(str(error).split())}") from None
-    if not isinstance(tree, dict):
-        raise DatasetError(f"{path}: holds no camera: expected a mapping with camera_matrix or K")
-    K = _numbers(path, tree, ("camera_matrix", "K", "k", "Camera_Matrix"))
-    if K is None:
-        raise DatasetError(f"{path}: has neither camera_matrix nor K")
-    if len(K) != 9:
-        raise DatasetError(f"{path}: its camera matrix has {len(K)} numbers, not 9")
-    if max(abs(K[i]) for i in (1, 3, 6, 7)) > 1e-6 * max(abs(K[0]), 1.0) or K[8] != 1.0:
-        raise DatasetError(f"{path}: its camera matrix has a skew, or is none: {K}")
-    keys = ("distortion_coefficients", "D", "d", "Distortion_Coefficients", "distortion")
-    distortion = _numbers(path, tree, keys) or []
-    model = str(tree.get("distortion_model") or "")
-    if model not in DISTORTIONS and any(distortion):
-        raise DatasetError(f"{path}: distortion_model {model} is not supported (only {', '.join(DISTORTIONS[:4])})")
-    # OpenCV's calibration sample writes `fisheye_model: 1`; an equidistant lens bends the image with zeros too
-    fisheye = model == "equidistant" or bool(tree.get("fisheye_model"))
-    if fisheye and len(distortion) > 4:
-        raise DatasetError(f"{path}: a fisheye model has 4 coefficients, not {len(distortion)}")
-    return Intrinsics(
-        fx_px=K[0],
-        fy_px=K[4],
-        cx_px=K[2],
-        cy_px=K[5],
-        distortion=tuple(distortion) if any(distortion) or fisheye else (),
-        fisheye=fisheye,
-        width_px=_size(path, tree, "width"),
-        height_px=_size(path, tree, "height"),
-        source=str(path),
-    )
-
-
-def _numbers(path: Path, tree: Mapping[str, Any], keys: Iterable[str]) -> list[float] | None:
-    for key in keys:
-        value = tree.get(key)
-        if value is None:
-            continue
-        data = value.get("data") if isinstance(value, dict) else value
-        try:
-            numbers = np.array(data, dtype=np.float64).ravel()
-        except (TypeError, ValueError):
-            raise DatasetError(f"{path}: {key} holds something that is no number") from None
-        if not np.isfinite(numbers).all():
-            raise DatasetError(f"{path}: {key} has numbers that are not finite")
-        out: list[float] = numbers.tolist()
-        return out
-    return None
-
-
-def _size(path: Path, tree: Mapping[str, Any], what: str) -> int | None:
-    value = tree.get(f"image_{what}", tree.get(what))
-    if value is None:
-        return None
-    if not isinstance(value, int) or value < 1:
-        raise DatasetError(f"{path}: the image's {what} is {value!r}")
-    return value
 
 
 def from_chessboard(folder: Path, columns: int, rows: int, square_m: float) -> Intrinsics:

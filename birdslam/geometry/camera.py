@@ -77,8 +77,8 @@ def plane_tilt(normal: Floats) -> tuple[float, float]:
 class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A pinhole camera over a road, as a camera file (TOML) states it.
 
-    `distortion` holds OpenCV's coefficients (k1, k2, p1, p2[, k3[, k4, k5, k6]]), empty for an undistorted image. A
-    `fisheye` lens has those of the equidistant model (k1, k2, k3, k4; Kannala and Brandt 2006), as in ROS and OpenCV.
+    `distortion` holds 4, 5, 8, 12 or 14 coefficients of OpenCV (k1, k2, p1, p2, k3, ...), empty for undistorted
+    images. A `fisheye` lens has those of the equidistant model (k1, k2, k3, k4; Kannala and Brandt 2006).
     Raises ValueError (on decoding: msgspec.ValidationError) for values outside the range of cameras.
     """
 
@@ -91,7 +91,7 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     height_m: Positive  # over the road: the metric scale
     pitch_rad: float = 0.0  # against the road; > 0: nose down
     roll_rad: float = 0.0  # > 0: right side down
-    # OpenCV's coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]]; empty: undistorted images
+    # 4, 5, 8, 12 or 14 coefficients of OpenCV: k1, k2, p1, p2, k3, ...; empty: undistorted images
     distortion: tuple[float, ...] = ()
     tilt_sigma_rad: Positive = 0.015  # 1-sigma of pitch and roll; the default is for a bracket mounted by hand
     fisheye: bool = False  # `distortion` is k1, k2, k3, k4 of the equidistant model
@@ -115,12 +115,12 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(
                 f"camera: focal lengths {self.fx_px}, {self.fy_px} px do not fit a {self.width_px} px image"
             )
-        if not 0.2 < self.height_m < 5.0:
+        if not 0.2 <= self.height_m <= 5.0:
             raise ValueError(f"camera: height_m = {self.height_m} is outside 0.2 to 5 m; measure it over the road")
         if abs(self.pitch_rad) > 0.5 or abs(self.roll_rad) > 0.5:
             raise ValueError("camera: pitch_rad and roll_rad must lie within 0.5 rad")
-        if len(self.distortion) not in (0, 4, 5, 8):
-            raise ValueError(f"camera: distortion needs 0, 4, 5 or 8 coefficients, got {len(self.distortion)}")
+        if len(self.distortion) not in (0, 4, 5, 8, 12, 14):
+            raise ValueError(f"camera: distortion needs 0, 4, 5, 8, 12 or 14 coefficients, got {len(self.distortion)}")
         if self.fisheye and len(self.distortion) != 4:
             raise ValueError(f"camera: a fisheye needs 4 distortion coefficients, got {len(self.distortion)}")
 

@@ -26,7 +26,7 @@ from birdslam.outputs.line_map import LineMap
 from birdslam.outputs.placed import AROUND_FILES, PLACES_FILE, ROAD_IN_MAP, write_around
 from birdslam.outputs.plain_words import DriveCounts, LengthsBy, readme, verdict
 from birdslam.outputs.scene_recorder import MAX_POSES, MAX_TRACKS, SceneRecorder, Thinned
-from birdslam.trajectory import CameraTrajectory, Transform, ego_pose, kitti_row, tum_row
+from birdslam.trajectory import CameraTrajectory, JoinedTrajectory, Transform, ego_pose, kitti_row, tum_row
 from birdslam.types import INVALIDATING, Attitude, Estimate, MapUpdate, Status, VehicleEstimate
 
 FILLED_FRAMES = 10_000  # a longer gap in the frame numbers is a new source, not dropped frames
@@ -106,7 +106,7 @@ class Recorder:
         self._table.write(",".join(FRAME_COLUMNS) + "\n")
         self.statuses: Counter[str] = Counter()
         self.speed_sources: Counter[str] = Counter()
-        self._trajectory = CameraTrajectory(camera.ground)
+        self._trajectory, self._ego = CameraTrajectory(camera.ground), JoinedTrajectory()
         self._next_row = 0
         self._frames = self._invalid = 0
         self._ends_unreadable = False  # the newest picture was damaged or missing
@@ -153,7 +153,7 @@ class Recorder:
         self._ends_unreadable = Status.FRAME_UNREADABLE in estimate.status
         self._table.write(self._frame_row(estimate) + "\n")
         pose = ego_pose(estimate.T_world_ego, estimate.attitude)
-        self._tum.write(tum_row(estimate.t_source_ns, pose) + "\n")
+        self._tum.write(tum_row(estimate.t_source_ns, self._ego.add(estimate.epoch, pose)) + "\n")
         self._write_row(estimate, pose)
         self._scene.add(estimate)
         self._lines.add(estimate, self._scene.T_picture_world)
@@ -226,7 +226,7 @@ class Recorder:
 
     def _begin_epoch(self, estimate: Estimate) -> None:
         if self._last is not None:
-            self._tum.write(f"# epoch {estimate.epoch}: a new world frame begins\n")
+            self._tum.write(f"# epoch {estimate.epoch}: a new world frame begins; its poses continue at the last one\n")
         self._epoch = estimate.epoch
         self._epoch_count += 1
 

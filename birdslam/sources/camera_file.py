@@ -19,7 +19,10 @@ def load_camera(path: Path) -> Camera:
         return msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), Camera)
     except OSError as error:
         raise DatasetError(f"camera file {path}: can't be read: {error.strerror}") from None
-    except (ValueError, msgspec.ValidationError) as error:  # ValueError: no UTF-8, or no TOML
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        remedy = "`birdslam calibrate RECORDING --intrinsics FILE` takes calibrations of other projects"
+        raise DatasetError(f"camera file {path}: no TOML ({error}); {remedy}") from None
+    except (ValueError, msgspec.ValidationError) as error:
         raise DatasetError(f"camera file {path}: {error}") from None
 
 

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from birdslam.calibration.intrinsics import Intrinsics, from_chessboard, read_intrinsics
+from birdslam.calibration.camera_files import read_intrinsics
+from birdslam.calibration.intrinsics import Intrinsics, from_chessboard
 from birdslam.calibration.lens import (
     FIELD_OF_VIEW_DEG,
     STATED_SIGMA_REL,
@@ -28,7 +29,7 @@ class Given:
     """What is known of the camera beside the drive: intrinsics from at most one of the first three, and lengths."""
 
     camera: Path | None = None  # an older camera file
-    intrinsics: Path | None = None  # KITTI's calib.txt, or ROS or OpenCV YAML
+    intrinsics: Path | None = None  # a calibration file of another project
     chessboard: Path | None = None  # a directory of images
     board: tuple[int, int] = (9, 6)  # the chessboard's inner corners: columns, rows
     square_m: float = 0.025

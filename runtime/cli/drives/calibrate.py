@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--output", required=True, metavar="CAMERA.toml", help="the camera file to write")
     lens = parser.add_mutually_exclusive_group()
     lens.add_argument("--camera", metavar="FILE", help="an older camera file: its intrinsics and height")
-    lens.add_argument("--intrinsics", type=Path, metavar="FILE", help="KITTI's calib.txt, or ROS or OpenCV YAML")
+    lens.add_argument("--intrinsics", type=Path, metavar="FILE", help="calibration of another project")
     lens.add_argument("--chessboard", type=Path, metavar="DIR", help="images of a chessboard")
     parser.add_argument("--board", default="9x6", metavar="COLSxROWS", help="its inner corners (default 9x6)")
     parser.add_argument("--square-mm", type=float, default=25.0, metavar="MM", help="a square's side (default 25)")

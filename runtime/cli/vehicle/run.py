@@ -8,6 +8,7 @@ from pathlib import Path
 
 import msgspec
 
+from birdslam.calibration.camera_files import format_of
 from birdslam.outputs.plain_words import LengthsBy
 from birdslam.perception import ModelError
 from birdslam.runtime.cli.arguments import (
@@ -57,15 +58,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Runs until the source ends and returns the exit status."""
+    lens = _lens_of_another_project(options)
     configuration = configuration_of(options)
     scheme = scheme_of(configuration.source.uri, all_schemes())
     if scheme is VIDEO and not options.model and not configuration.models.given() and configuration.models.shipped:
         options.model = list(_networks(configuration, options.yes))
         configuration = configuration_of(options)
-    if options.height is None and (scheme is not VIDEO or configuration.camera is not None):
+    if options.height is None and lens is None and (scheme is not VIDEO or configuration.camera is not None):
         return run_processes(configuration)
-    configuration, lengths_by = _calibrated(configuration, options)
+    configuration, lengths_by = _calibrated(configuration, options, lens)
     return run_processes(configuration, lengths_by)
+
+
+def _lens_of_another_project(options: argparse.Namespace) -> Path | None:
+    """Takes `--camera` out of the options where it names a calibration of another project, for the first pass.
+
+    A live camera has no first pass, and the file lacks the height over the road.
+    """
+    if not options.camera or is_live(options.source or "") or format_of(Path(options.camera)) is None:
+        return None
+    path, options.camera = Path(options.camera), None
+    return path
 
 
 def _networks(configuration: Configuration, fetch_them: bool) -> tuple[str, ...]:
@@ -91,10 +104,12 @@ def _networks(configuration: Configuration, fetch_them: bool) -> tuple[str, ...]
     return recommended(directory).at_hand
 
 
-def _calibrated(configuration: Configuration, options: argparse.Namespace) -> tuple[Configuration, LengthsBy]:
+def _calibrated(
+    configuration: Configuration, options: argparse.Namespace, lens: Path | None
+) -> tuple[Configuration, LengthsBy]:
     """Returns the configuration with the camera estimated by a first pass, and what its scale rests on.
 
-    Writes the camera file beside the results.
+    `lens` is a calibration of another project. Writes the camera file beside the results.
     """
     # A late import: it loads the whole front end
     from birdslam.runtime.calibration.drive import ROUGH, calibrate_drive
@@ -109,7 +124,7 @@ def _calibrated(configuration: Configuration, options: argparse.Namespace) -> tu
             f"--height: {source.uri} is live and has no first pass; run `birdslam calibrate` on a film of this camera"
         )
     speed = Path(source.speed).expanduser() if source.speed else None
-    given = Given(height_m=options.height, fov_deg=options.fov, kind=options.kind, speed=speed)
+    given = Given(intrinsics=lens, height_m=options.height, fov_deg=options.fov, kind=options.kind, speed=speed)
     found = calibrate_drive(configuration, source.uri, given, source.stride, ROUGH, must_show=False)
     path = Path(configuration.output) / "camera.toml"
     write_camera_file(path, found.camera, found.report)
