@@ -83,7 +83,7 @@ GROUPS = (
     Group(
         "Results",
         "See [recording.md](recording.md). Options: `--output`, `--record`, `--record-images`, `--smooth`, `--video`, "
-        "`--map`, `--map-only`, `--gnss`.",
+        "`--map`, `--map-only`, `--gnss`, `--gnss-offset`.",
         {
             "output": "Folder of the results",
             "results.smooth": "Also write smoothed trajectories: tracks/ID.final.tum.txt, ego.final.*",
@@ -92,6 +92,8 @@ GROUPS = (
             "[maps.md](maps.md)",
             "results.gnss": "GNSS fixes: a file (CSV, NMEA, GPX), topic:/NAME of a ROS bag, or a receiver "
             '/dev/TTY[@BAUD]; "": none',
+            "results.gnss_offset_s": "Time from the first fix of the file to the first image; none: by the clocks, "
+            "or where these are unrelated by the shape of the drive",
             "results.map_only": 'Map in which the drive is localized without a change to it; "": none',
             "recording.file": 'Recording: FILE.mcap, which must not exist, or a folder for a new file; "": none',
             "recording.images": "Also record the images, as JPEG",
@@ -116,7 +118,6 @@ GROUPS = (
             "slam.frontend.external.sigma_scale_rel": "1-sigma of its scale",
             "slam.frontend.external.sigma_direction_rad": "1-sigma of its direction of travel",
             "slam.frontend.external.sigma_yaw_rad": "1-sigma of its rotation between two images",
-            "slam.frontend.external.longest_gap_s": "Longest gap between two poses that is interpolated",
             "source.topics.truth": "Ground truth topic for `evaluate odometry`: nav_msgs/Odometry or "
             'sensor_msgs/NavSatFix; "": none',
         },

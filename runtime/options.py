@@ -42,6 +42,7 @@ def overrides_of(options: argparse.Namespace) -> tuple[dict[str, Any], list[str]
     keys |= {"speed_topic": "source.topics.speed", "truth_topic": "source.topics.truth"}
     keys |= {"smooth": "results.smooth", "video": "results.video"}
     keys |= {"map": "results.map", "map_only": "results.map_only", "gnss": "results.gnss"}
+    keys |= {"gnss_offset": "results.gnss_offset_s"}
     keys |= {"router": "ros.router", "domain": "ros.domain", "namespace": "ros.namespace"}
     keys |= {"runtime_dir": "runtime.runtime_dir"}
     for name in ("camera", "vehicle", "output", *keys):

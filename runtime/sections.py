@@ -243,6 +243,7 @@ class ResultsConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     video: str = ""  # FILE.mp4: the frames with the estimated boxes beside the bird's-eye view; "": none
     map: str = ""  # FILE: the map of places, localised in and made longer; "": none
     gnss: str = ""  # FILE: fixes, by which the drive and its map come to Earth; "": none
+    gnss_offset_s: float | None = None  # from the file's first fix to the first frame; None: by their clocks and shapes
     map_only: str = ""  # FILE: localised in it, and it stays as it is; "": none
 
 

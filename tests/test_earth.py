@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.gnss.earth import Earth, EarthError, GnssFix, place_on_earth
-from birdslam.loops.gnss.files import GnssError, read_fixes
+from birdslam.loops.gnss.files import GnssError, read_fixes, read_track
 from birdslam.outputs.earth_files import Way, write_ways
 
 ORIGIN = 51.05, -114.05
@@ -145,7 +145,7 @@ def test_csv_nmea_and_gpx_are_read() -> None:
     ("data", "why"),
     [
         (b"", "empty"),
-        (b"\xff\xfe", "no text"),
+        (b"\xff\xfe\x00", "no text"),
         (b"t,lat\n", "name the columns"),
         (b"time_s,latitude_deg,longitude_deg\n", "no fix"),
         (b"time_s,latitude_deg,longitude_deg\n0,91,0\n", "line 2"),
@@ -166,6 +166,64 @@ def test_mutated_files_give_fixes_or_the_error(good: bytes, place: int, noise: b
     except GnssError:
         return
     assert all(abs(fix.latitude_deg) <= 90.0 and math.isfinite(fix.sigma_m) for fix in fixes)
+
+
+def test_a_track_of_another_clock_is_laid_where_it_has_the_drives_shape() -> None:
+    """The fixes begin ten minutes before the drive and end two minutes after it."""
+    t_ns, poses, enu = a_drive()
+    before = enu[0] + np.outer(np.arange(600, 0, -1), (-7.0, 3.0)) + 40.0 * np.sin(np.arange(600))[:, None]
+    after = enu[-1] + np.outer(np.arange(1, 121), (2.0, 9.0))
+    track = np.concatenate([before, enu[::10], after])
+    times_ns = np.arange(len(track), dtype=np.int64) * 1_000_000_000
+    lat, lon, _ = pymap3d.enu2geodetic(track[:, 0], track[:, 1], 0.0, *ORIGIN, 0.0)
+    rows = zip(times_ns.tolist(), lat.tolist(), lon.tolist(), strict=True)
+    fixes = [GnssFix(t_source_ns=t, latitude_deg=a, longitude_deg=b, sigma_m=2.0) for t, a, b in rows]
+    earth = place_on_earth(t_ns, poses, fixes, clock_is_known=False)
+    assert worst_m(earth, poses, enu) < 5.0
+    assert earth.delay_s == pytest.approx(600.0, abs=0.5)
+
+
+def test_a_straight_drive_within_a_straight_track_of_another_clock_is_an_error() -> None:
+    t_ns, poses, enu = a_drive()
+    straight = fixes_of(t_ns, enu, 1.0)[:25]  # before the turn
+    with pytest.raises(EarthError, match="--gnss-offset"):
+        place_on_earth(t_ns[:100], poses[:100], straight, clock_is_known=False)
+    assert place_on_earth(t_ns[:100], poses[:100], straight).fixes >= 9
+
+
+def test_the_stated_offset_ties_a_track_to_the_recording() -> None:
+    (first, second), known = read_track(GPX, "a.gpx", 7, 1.5).fixes, read_track(GPX, "a.gpx", 7, 1.5).clock_is_known
+    assert (first.t_source_ns, second.t_source_ns) == (7 - 1_500_000_000, 7 + 500_000_000)
+    assert known
+    assert not read_track(GPX, "a.gpx", 7).clock_is_known
+
+
+GGA = "GPGGA,{},4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,"
+
+
+@pytest.mark.parametrize("before", [b"", b"[1541616573000]", b" "])
+def test_nmea_is_recognized_behind_what_dashcams_write_before_it(before: bytes) -> None:
+    """The first line is cut off; each sentence may have a time in brackets."""
+    (fix,) = read_fixes(b"31.000,E,022.4,084.4*11\r\n" + before + sentence(RMC), "a.nmea", 0)
+    assert fix.latitude_deg == pytest.approx(48.0 + 7.038 / 60.0)
+
+
+def test_fixes_without_a_date_go_on_over_midnight() -> None:
+    lines = b"".join(sentence(GGA.format(time)) for time in ("235958.00", "235959.50", "000001.00"))
+    fixes = read_fixes(lines, "a.nmea", 5)
+    assert [fix.t_source_ns - 5 for fix in fixes] == [0, 1_500_000_000, 3_000_000_000]
+    noon_s = 1_700_000_000 // 86_400 * 86_400 + 43_200
+    begin_ns = (noon_s + 12 * 3_600 - 2) * 1_000_000_000  # the recording's clock is UTC: the fixes are of its day
+    assert [fix.t_source_ns - begin_ns for fix in read_fixes(lines, "a.nmea", begin_ns)] == [0, 1.5e9, 3e9]
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_a_table_is_read_by_what_its_columns_mean(encoding: str) -> None:
+    text = "Time,Lat,Lon,Speed_kmh\n1700000000.5,51.0,7.0,36\n1700000001.5,51.1,7.0,\n"
+    track = read_track(text.encode(encoding), "a.csv", 3)
+    assert [fix.t_source_ns for fix in track.fixes] == [3, 1_000_000_003]  # Unix time, and the film begins at 0
+    assert track.fixes[0].speed_mps == pytest.approx(10.0)
+    assert not track.clock_is_known
 
 
 # --- files out ---

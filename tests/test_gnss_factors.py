@@ -332,7 +332,7 @@ def test_fixes_of_a_bag_bear_their_covariance(tmp_path: Path) -> None:
     configuration = load(None, {"source.uri": f"rosbag:{bag}", "results.gnss": "topic:/gps/fix", "camera": camera})
     fixes = recorded_fixes(configuration)
     assert fixes is not None
-    assert [fix.sigma_m for fix in fixes(0)] == [5.0, 2.0, 2.0]
+    assert [fix.sigma_m for fix in fixes(0).fixes] == [5.0, 2.0, 2.0]
     with pytest.raises(ConfigurationError, match="no ROS bag"):
         recorded_fixes(load(None, {"source.uri": "demo", "results.gnss": "topic:/gps/fix"}))
 

@@ -195,3 +195,25 @@ def test_fixes_alone_give_the_speed(tmp_path: Path) -> None:
 def test_a_table_that_is_none_is_named(text: str, said: str, tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=said):
         read_speeds(file(tmp_path, text))
+
+
+def test_a_track_gives_the_speed(tmp_path: Path) -> None:
+    """1.1 m a second to the north, by GPX without speeds; the film's clock begins at 0."""
+    path, step_deg = tmp_path / "track.gpx", math.degrees(1.1 / 6_371_000.0)
+    points = "".join(
+        f'<trkpt lat="{50.0 + k * step_deg:.9f}" lon="7.0"><time>2024-05-01T10:00:{k:02d}Z</time></trkpt>'
+        for k in range(5)
+    )
+    path.write_text(f"<gpx><trk><trkseg>{points}</trkseg></trk></gpx>")
+    readings = read_speeds(path).readings
+    assert [reading.speed_mps for reading in readings] == pytest.approx([1.1] * len(readings), rel=1e-3)
+    assert (readings[0].t_ns, readings[-1].t_ns) == (500_000_000, 3_500_000_000)
+    path.write_text("<gpx></gpx>")
+    with pytest.raises(DatasetError, match="has no fix"):
+        read_speeds(path)
+
+
+def test_a_table_in_utf_16_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "speed.csv"
+    path.write_bytes("time_s,speed_kmh\n0.0,36\n1.0,72\n".encode("utf-16"))
+    assert [reading.speed_mps for reading in read_speeds(path).readings] == pytest.approx([10.0, 20.0])

@@ -14,9 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from birdslam.geometry.arrays import Floats
+from birdslam.loops.gnss.files import GnssError, read_fixes
 from birdslam.sources.recording import DatasetError, Recording, check_times
 from birdslam.sources.speed_log import SpeedLog
-from birdslam.sources.speed_tables import names_columns, table_readings
+from birdslam.sources.speed_tables import fix_speeds, names_columns, table_readings
 from birdslam.types import NS_PER_S, SpeedReading
 
 # 1-sigma where a file states none; a judgement: some steps of a wheel sensor's message (often 0.1 km/h), and
@@ -28,13 +29,13 @@ _MAX_COLUMNS = 5
 _MAX_S = 9e9  # a time in ns has 63 bits
 
 
-def read_speeds(path: Path) -> SpeedLog:
+def read_speeds(path: Path, begin_ns: int = 0) -> SpeedLog:
     """The readings of a file in its order, unchecked: the method rejects those of a faulty sensor (NaN, backwards in
-    time).
+    time). `begin_ns` is the recording's first time, for tracks in UTC.
 
     Raises DatasetError for a file that can't be read, an invalid line, and an empty file.
     """
-    readings = [reading for _, reading in _lines(path)]
+    readings = [reading for _, reading in _lines(path, begin_ns)]
     if not readings:
         raise DatasetError(f"{path}: holds no speeds")
     return SpeedLog(readings)
@@ -65,19 +66,25 @@ def with_speeds(recording: Recording, path: Path) -> Recording:
 
     Raises DatasetError, also where all the file's times lie outside the recording's: then they are of another clock.
     """
-    log = read_speeds(path)
+    first = next(iter(recording.frames()), None)
+    log = read_speeds(path, 0 if first is None else first.t_source_ns)
     times = [reading.t_ns for reading in log.readings]
     check_times(recording, path, min(times), max(times))
     recording.speeds = log
     return recording
 
 
-def _lines(path: Path) -> Iterator[tuple[int, SpeedReading]]:
+def _lines(path: Path, begin_ns: int = 0) -> Iterator[tuple[int, SpeedReading]]:
     """Number and reading of each line that holds one. Raises DatasetError."""
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        data = path.read_bytes()
+        text = data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(f"{path}: can't be read: {getattr(error, 'strerror', None) or 'not UTF-8'}") from None
+    if text.lstrip()[:1] in ("<", "$", "["):
+        yield from _of_track(path, data, begin_ns)
+        return
+    lines = text.splitlines()
     texts = [(number, line, line.partition("#")[0].strip()) for number, line in enumerate(lines, start=1)]
     texts = [entry for entry in texts if entry[2]]
     if texts and names_columns(texts[0][2]):
@@ -91,6 +98,15 @@ def _lines(path: Path) -> Iterator[tuple[int, SpeedReading]]:
                 f"{path}: line {number} is no time in s and speed in m/s (with or without sigma, yaw rate and its "
                 f"sigma): {line[:40]!r}"
             ) from None
+
+
+def _of_track(path: Path, data: bytes, begin_ns: int) -> Iterator[tuple[int, SpeedReading]]:
+    """The speeds of a GPX or NMEA track: those that it states, else those between its fixes."""
+    try:
+        fixes = read_fixes(data, str(path), begin_ns)
+    except GnssError as error:
+        raise DatasetError(str(error)) from None
+    yield from fix_speeds([(fix.t_source_ns, fix.latitude_deg, fix.longitude_deg, fix.speed_mps) for fix in fixes])
 
 
 def _reading(words: list[str]) -> SpeedReading:

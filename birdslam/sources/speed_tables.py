@@ -67,6 +67,19 @@ def table_readings(path: Path, lines: Sequence[tuple[int, str]]) -> Iterator[tup
         yield from _by_speeds(rows, _SPEED_SIGMA_MPS)
 
 
+def fix_speeds(fixes: Sequence[tuple[int, float, float, float | None]]) -> Iterator[tuple[int, SpeedReading]]:
+    """Number and reading of GNSS fixes: time in ns, latitude and longitude in degrees, and a speed where one is stated.
+
+    Where fewer than half of them state one, the speeds are those between the fixes.
+    """
+    rows: list[_Row] = []
+    for number, (t_ns, latitude_deg, longitude_deg, speed_mps) in enumerate(fixes, start=1):
+        row = {"time": t_ns / NS_PER_S, "latitude": latitude_deg, "longitude": longitude_deg}
+        rows.append((number, row if speed_mps is None else {**row, "speed": speed_mps}))
+    stated = sum("speed" in row for _, row in rows)
+    yield from _filled_up(_by_speeds(rows, GPS_SIGMA_MPS) if 2 * stated > len(rows) else _by_fixes(rows))
+
+
 def _by_speeds(rows: Sequence[_Row], sigma_mps: float) -> Iterator[tuple[int, SpeedReading]]:
     for number, row in rows:
         if "speed" in row:

@@ -76,6 +76,8 @@ def add_map(parser: argparse.ArgumentParser) -> None:
         "georeferences trajectory and map: ego.geojson, ego.gpx, ego.kml"
     )
     parser.add_argument("--gnss", metavar="FILE", help=text)
+    text = "time from the first fix of the file to the first frame; default: by the clocks, or by the drive's shape"
+    parser.add_argument("--gnss-offset", type=float, metavar="S", help=text)
 
 
 def add_vehicle(parser: argparse.ArgumentParser) -> None:

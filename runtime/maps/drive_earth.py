@@ -17,6 +17,7 @@ from birdslam.geometry.se2 import SE2
 from birdslam.loops.drift import link_cov
 from birdslam.loops.gnss.earth import Earth, EarthError, GnssFix, place_on_earth
 from birdslam.loops.gnss.factors import Node, OnEarth, fixed_keyframes, tie
+from birdslam.loops.gnss.files import Track
 from birdslam.loops.keyframe import Link, Placed
 from birdslam.loops.keyframe_builder import SPACING_M
 from birdslam.loops.place_map import PlaceMap
@@ -51,9 +52,10 @@ def write_earth(
     """
     if not places:
         raise EarthError("the drive has no pose")
-    fixes = list(fixes_from(places[0].t_source_ns) if callable(fixes_from) else fixes_from)
+    track = fixes_from(places[0].t_source_ns) if callable(fixes_from) else Track(list(fixes_from))
+    fixes = track.fixes
     t_ns, way = np.array([each.t_source_ns for each in places], np.int64), [each.T_map_ego for each in places]
-    earth = place_on_earth(t_ns, way, fixes)
+    earth = place_on_earth(t_ns, way, fixes, track.clock_is_known)
     nodes: Sequence[Placed]
     if place_map is not None and len(place_map):
         nodes, links, before = place_map.keyframes, place_map.links, place_map.fixed()

@@ -19,7 +19,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from birdslam.loops.gnss.earth import DEFAULT_SIGMA_M, GnssFix
-from birdslam.loops.gnss.files import GNSS_FILE, MAX_BYTES, MAX_FIXES, GnssError, checked_fix, read_fixes
+from birdslam.loops.gnss.files import GNSS_FILE, MAX_BYTES, MAX_FIXES, GnssError, Track, checked_fix, read_track
 from birdslam.loops.gnss.sentences import NmeaReader, Sentence
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.schemes import ROS, all_schemes
@@ -34,7 +34,7 @@ REOPEN_S = 1.0
 
 log = logging.getLogger(__name__)
 
-Fixes = Callable[[int], list[GnssFix]]  # of the recording's first time in ns; raises GnssError
+Fixes = Callable[[int], Track]  # of the recording's first time in ns; raises GnssError
 
 
 def is_serial(name: str) -> bool:
@@ -54,22 +54,23 @@ def recorded_fixes(configuration: Configuration) -> Fixes | None:
         return lambda begin_ns: _that_came(Path(configuration.output) / GNSS_FILE, begin_ns)
     if name.startswith(TOPIC):
         found = _of_bag(configuration, name.removeprefix(TOPIC))
-        return lambda begin_ns: found
+        return lambda begin_ns: Track(found)
     path = Path(name).expanduser()
     try:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
     except OSError as error:
         raise GnssError(f"{path}: can't be read: {error.strerror}") from None
-    read_fixes(data, str(path), 0)  # what is wrong with it is said before the drive
-    return lambda begin_ns: read_fixes(data, str(path), begin_ns)
+    offset_s = configuration.results.gnss_offset_s
+    read_track(data, str(path), 0, offset_s)  # what is wrong with it is said before the drive
+    return lambda begin_ns: read_track(data, str(path), begin_ns, offset_s)
 
 
-def _that_came(path: Path, begin_ns: int) -> list[GnssFix]:
+def _that_came(path: Path, begin_ns: int) -> Track:
     """What the source wrote while the car drove (runtime/ros/camera.py)."""
     if not path.is_file():
         raise GnssError(f"{path}: no fix came")
-    return read_fixes(path.read_bytes(), str(path), begin_ns)
+    return read_track(path.read_bytes(), str(path), begin_ns)
 
 
 def _of_bag(configuration: Configuration, topic: str) -> list[GnssFix]:

@@ -24,6 +24,8 @@ GATE = 3.0  # standard deviations
 DELAYS_S = np.arange(-2.0, 2.01, 0.1)
 DELAY_SIGMA_S = 0.5
 WINDOW_S, MAX_WINDOWS = 60.0, 10  # in which fixes are compared with odometry for their delay
+OFFSET_STEP_S, MAX_OFFSETS = 1.0, 3600  # of the parts of a longer track that are compared with a drive
+SURE_COST = math.log(1000.0)  # by which the best part has to be better than every other
 START_FIXES = 60  # whose pairs are tried for a start
 START_REL = 0.1  # drift of odometry over the distance from the centre, up to which a fix agrees with a start
 ITERATIONS, WINDOW_ITERATIONS = 30, 16
@@ -149,8 +151,11 @@ def _view_deg(camera: Camera, scale: float) -> float:
     return 2.0 * math.degrees(half if camera.fisheye else math.atan(half))
 
 
-def place_on_earth(t_ns: Ints, poses: list[SE2], fixes: list[GnssFix]) -> Earth:
-    """The map's frame on Earth, by a drive's poses in it (times growing) and its fixes. Raises EarthError."""
+def place_on_earth(t_ns: Ints, poses: list[SE2], fixes: list[GnssFix], clock_is_known: bool = True) -> Earth:
+    """Returns the map's frame on Earth, by a drive's poses in it (times growing) and its fixes. Raises EarthError.
+
+    Where the fixes have another clock, the part of their track that has the shape of the drive is found first.
+    """
     import pymap3d  # here: only who goes to Earth needs it
 
     if not fixes or len(poses) < 2:
@@ -162,7 +167,9 @@ def place_on_earth(t_ns: Ints, poses: list[SE2], fixes: list[GnssFix]) -> Earth:
     origin = _central(degrees)
     east, north, _ = pymap3d.geodetic2enu(degrees[:, 0], degrees[:, 1], 0.0, *origin, 0.0)
     enu, sigma = np.column_stack([east, north]), np.array([max(fix.sigma_m, 0.01) for fix in fixes])
-    delay_s, delay_sigma_s = _delay(seconds, xy, times, enu, sigma)
+    offset_s = 0.0 if clock_is_known else _offset_s(seconds, xy, times, enu, sigma)
+    delay_s, delay_sigma_s = _delay(seconds, xy, times - offset_s, enu, sigma)
+    delay_s += offset_s
     late_m = delay_sigma_s * float(np.hypot(*np.diff(xy, axis=0).T).sum() / seconds[-1])
     at = times - delay_s
     inside = (at >= seconds[0]) & (at <= seconds[-1])
@@ -194,6 +201,35 @@ def place_on_earth(t_ns: Ints, poses: list[SE2], fixes: list[GnssFix]) -> Earth:
         late_m,
         log_scale,
     ).with_cov(cov)
+
+
+def _offset_s(seconds: Floats, xy: Floats, times: Floats, enu: Floats, sigma: Floats) -> float:
+    """Returns by how much later than the first fix the drive begins, where the fixes' clock is another one.
+
+    The similarity fit of every part of the track that is as long as the drive is compared by its costs (robust, as in
+    `_delay`, with the prior of the scale). Raises EarthError where two parts fit alike.
+    """
+    longest_s = float(times[-1] - times[0] - seconds[-1])
+    if longest_s <= OFFSET_STEP_S:
+        return 0.0
+    offsets = np.arange(0.0, longest_s + OFFSET_STEP_S, max(OFFSET_STEP_S, longest_s / MAX_OFFSETS))
+    costs = np.full(len(offsets), np.inf)
+    for k, offset_s in enumerate(offsets):
+        at = times - offset_s
+        inside = (at >= seconds[0]) & (at <= seconds[-1])
+        if inside.sum() > MIN_FIXES:
+            here = np.column_stack([np.interp(at[inside], seconds, column) for column in xy.T])
+            found, _, chi2 = fit(here, enu[inside], sigma[inside], WINDOW_ITERATIONS)
+            costs[k] = float(np.log1p(chi2).sum()) + 0.5 * (found[3] / SCALE_SIGMA) ** 2
+    best = int(costs.argmin())
+    others = costs[np.abs(offsets - offsets[best]) > 2.0 * DELAYS_S[-1]]
+    if not np.isfinite(costs[best]) or (len(others) and others.min() < costs[best] + SURE_COST):
+        raise EarthError(
+            f"the track of fixes lasts {times[-1] - times[0]:.0f} s and the drive {seconds[-1]:.0f} s by unrelated "
+            "clocks, and several parts of the track have the drive's shape; state the time from the first fix to the "
+            "first frame (--gnss-offset S)"
+        )
+    return float(offsets[best])
 
 
 def _delay(seconds: Floats, xy: Floats, times: Floats, enu: Floats, sigma: Floats) -> tuple[float, float]:

@@ -1,7 +1,8 @@
-"""GNSS fixes from files: CSV with a head, NMEA 0183 sentences, GPX tracks. Untrusted input like any other.
+"""GNSS fixes from files: CSV with named columns, NMEA 0183 sentences, GPX tracks. The input is not trusted.
 
-Times are brought to the recording's clock: those of a CSV are seconds of that clock; NMEA and GPX tell UTC, which is
-the recording's own where it begins within a day of them, and else begins with it.
+The times of a CSV are seconds of the recording's clock, or Unix time; NMEA and GPX have UTC. UTC is the recording's own
+clock where it begins within a day of the fixes. Else the clocks are unrelated, and the first fix gets the time of the
+first frame: `Track.clock_is_known` is false.
 """
 
 from __future__ import annotations
@@ -9,47 +10,79 @@ from __future__ import annotations
 import csv
 import io
 import math
+import re
+from dataclasses import dataclass
 from datetime import datetime
 from xml.etree import ElementTree
 
 from birdslam.loops.gnss.earth import DEFAULT_SIGMA_M, GnssFix, is_on_earth
-from birdslam.loops.gnss.sentences import SIGMA_PER_HDOP_M, NmeaReader, Sentence
+from birdslam.loops.gnss.sentences import SIGMA_PER_HDOP_M, NmeaReader, Sentence, undated_fixes
 from birdslam.types import NS_PER_S
 
 MAX_BYTES, MAX_FIXES = 1 << 26, 1_000_000
 MAX_S = 4e9  # of a time in seconds, either way
 DAY_S = 86_400.0
+UNIX_FROM_S = 1e9  # a time in seconds from here on is Unix time: 2001 and later
+NMEA_LINES = 50  # among so many first lines one is a sentence
 GNSS_FILE = "gnss.csv"  # of the fixes that came while a car drove, in the drive's folder
 COLUMNS = "time_s, latitude_deg, longitude_deg, and where known sigma_m, speed_mps"
+_NAMES = {  # other names of the columns, and the factor to our unit
+    **dict.fromkeys(("t_s", "time", "t", "timestamp_s", "seconds", "unix_s"), ("time_s", 1.0)),
+    **dict.fromkeys(("latitude", "lat"), ("latitude_deg", 1.0)),
+    **dict.fromkeys(("longitude", "lon", "lng"), ("longitude_deg", 1.0)),
+    **dict.fromkeys(("speed", "velocity_mps"), ("speed_mps", 1.0)),
+    **dict.fromkeys(("speed_kmh", "speed_kph"), ("speed_mps", 1.0 / 3.6)),
+    **dict.fromkeys(("speed_mph",), ("speed_mps", 0.44704)),
+}
+_SENTENCE = re.compile(r"^\s*(\[\d+\])?[$!](?=[A-Z]{2})", re.MULTILINE)
 
 
 class GnssError(ValueError):
     """The file has no usable fixes."""
 
 
+@dataclass(frozen=True)
+class Track:
+    """Fixes in the order of their times, and whether these are times of the recording's clock."""
+
+    fixes: list[GnssFix]
+    clock_is_known: bool = True
+
+
 def read_fixes(data: bytes, name: str, begin_ns: int) -> list[GnssFix]:
-    """The fixes of a file's bytes, by their times; `begin_ns`: the recording's first time. Raises GnssError."""
+    """Returns the fixes of a file's bytes in the order of their times. Raises GnssError."""
+    return read_track(data, name, begin_ns).fixes
+
+
+def read_track(data: bytes, name: str, begin_ns: int, offset_s: float | None = None) -> Track:
+    """Reads the fixes of a file's bytes; `begin_ns` is the recording's first time. Raises GnssError.
+
+    `offset_s`, where the user states it, is the time from the first fix to the first frame.
+    """
     if len(data) > MAX_BYTES:
         raise GnssError(f"{name}: is larger than {MAX_BYTES >> 20} MiB")
     try:
-        text = data.decode("utf-8-sig")
+        text = data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
     except UnicodeDecodeError:
         raise GnssError(f"{name}: is no text") from None
-    begin = text.lstrip()[:1]
-    if begin == "<":
+    if text.lstrip()[:1] == "<":
         fixes, utc = _gpx(text, name), True
-    elif begin in ("$", "!"):
-        fixes, utc = _nmea(text, name), True
+    elif _SENTENCE.search("\n".join(text.splitlines()[:NMEA_LINES])):
+        fixes, utc = _nmea(text, name, begin_ns), True
     else:
-        fixes, utc = _csv(text, name), False
+        fixes = _csv(text, name)
+        utc = bool(fixes) and fixes[0][0] >= UNIX_FROM_S
     fixes = [fix for fix in fixes if fix[1] or fix[2]]  # receivers without a fix write 0, 0
     if not fixes:
         raise GnssError(f"{name}: has no fix")
     if len(fixes) > MAX_FIXES:
         raise GnssError(f"{name}: has more than {MAX_FIXES} fixes")
+    is_known = not utc or abs(fixes[0][0] - begin_ns / NS_PER_S) <= DAY_S
     first_s, first_ns = 0.0, 0
-    if utc and abs(fixes[0][0] - begin_ns / NS_PER_S) > DAY_S:
-        first_s, first_ns = fixes[0][0], begin_ns
+    if offset_s is not None:
+        first_s, first_ns = min(fix[0] for fix in fixes) + offset_s, begin_ns
+    elif not is_known:
+        first_s, first_ns = min(fix[0] for fix in fixes), begin_ns
     out = [
         GnssFix(
             t_source_ns=first_ns + round((t_s - first_s) * NS_PER_S),
@@ -60,7 +93,7 @@ def read_fixes(data: bytes, name: str, begin_ns: int) -> list[GnssFix]:
         )
         for t_s, latitude, longitude, sigma_m, speed_mps in fixes
     ]
-    return sorted(out, key=lambda fix: fix.t_source_ns)
+    return Track(sorted(out, key=lambda fix: fix.t_source_ns), is_known or offset_s is not None)
 
 
 def checked_fix(
@@ -95,7 +128,9 @@ def _csv(text: str, name: str) -> list[_Fix]:
         raise GnssError(f"{name}: is no CSV: {error}") from None
     if not rows:
         raise GnssError(f"{name}: is empty")
-    head = [word.strip().lower() for word in rows[0]]
+    written = [word.strip().lower() for word in rows[0]]
+    head = [_NAMES.get(word, (word, 1.0))[0] for word in written]
+    unit = {_NAMES[word][0]: _NAMES[word][1] for word in written if word in _NAMES}
     if not {"time_s", "latitude_deg", "longitude_deg"} <= set(head):
         raise GnssError(f"{name}: its first line has to name the columns {COLUMNS}")
     out = []
@@ -114,7 +149,7 @@ def _csv(text: str, name: str) -> list[_Fix]:
                     float(fields["latitude_deg"]),
                     float(fields["longitude_deg"]),
                     float(sigma) if sigma else DEFAULT_SIGMA_M,
-                    float(speed) if speed else None,
+                    float(speed) * unit.get("speed_mps", 1.0) if speed else None,
                 )
             )
         except (KeyError, ValueError) as error:
@@ -124,10 +159,14 @@ def _csv(text: str, name: str) -> list[_Fix]:
     return out
 
 
-def _nmea(text: str, name: str) -> list[_Fix]:
-    """RMC sentences, which tell date and speed, with the accuracy that GST or GGA of the same time tell."""
+def _nmea(text: str, name: str, begin_ns: int) -> list[_Fix]:
+    """RMC sentences, which have date and speed, with the accuracy of GST or GGA sentences of the same time.
+
+    Without any RMC sentence the fixes of GGA, whose day is that of the recording.
+    """
     reader, out = NmeaReader(), []
-    for number, line in enumerate(text.splitlines(), start=1):
+    lines = _SENTENCE.sub("$", text).splitlines()  # dashcams write a time in brackets before the sentence
+    for number, line in enumerate(lines, start=1):
         try:
             found = reader.take(line)
         except ValueError:
@@ -135,7 +174,13 @@ def _nmea(text: str, name: str) -> list[_Fix]:
         if found is not None:
             out.append(_checked(name, number, *found))
     last = reader.finish()
-    return out if last is None else [*out, _checked(name, number, *last)]
+    if last is not None:
+        out.append(_checked(name, number, *last))
+    if out:
+        return out
+    begin_s = begin_ns / NS_PER_S
+    near_s = begin_s if begin_s >= UNIX_FROM_S else UNIX_FROM_S
+    return [_checked(name, number, *fix) for number, fix in undated_fixes(lines, near_s)]
 
 
 def _gpx(text: str, name: str) -> list[_Fix]:

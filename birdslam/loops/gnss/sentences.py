@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 
 from birdslam.loops.gnss.earth import DEFAULT_SIGMA_M
 
 SIGMA_PER_HDOP_M = 4.0
 KNOT_MPS = 0.514444
+DAY_S = 86_400.0
 
 Sentence = tuple[float, float, float, float, float | None]  # UTC in s, latitude, longitude, sigma_m, speed_mps
 
@@ -54,6 +56,28 @@ class NmeaReader:
         self._waiting = None
         self._accuracy = {time: sigma for time, sigma in [*self._accuracy.items()][-2:] if time != time_text}
         return utc_s, latitude_deg, longitude_deg, sigma_m, speed_mps
+
+
+def undated_fixes(lines: Iterable[str], near_s: float) -> Iterator[tuple[int, Sentence]]:
+    """Number and fix of each GGA sentence, which has a time of day alone: of the day that begins nearest to `near_s`.
+
+    After midnight the next day begins. Sentences without a fix or with a wrong sum are skipped.
+    """
+    before_s: float | None = None
+    for number, line in enumerate(lines, start=1):
+        words = _words(line)
+        if words is None or words[0][-3:] != "GGA" or len(words) < 9 or words[6] in ("", "0"):
+            continue
+        try:
+            t_s = 3600.0 * int(words[1][:2]) + 60.0 * int(words[1][2:4]) + float(words[1][4:])
+            latitude_deg, longitude_deg = _degrees(words[2], words[3]), _degrees(words[4], words[5])
+            sigma_m = SIGMA_PER_HDOP_M * float(words[8]) if words[8] else DEFAULT_SIGMA_M
+        except ValueError:
+            continue
+        nearest_s = near_s if before_s is None else before_s
+        t_s += DAY_S * round((nearest_s - t_s) / DAY_S)
+        before_s = t_s
+        yield number, (t_s, latitude_deg, longitude_deg, sigma_m, None)
 
 
 def _words(line: str) -> list[str] | None:
