@@ -126,7 +126,7 @@ def test_each_head_runs_on_its_frames_and_a_late_one_is_skipped_and_said_so(monk
 
         def look() -> Perception:
             k = len(seen)
-            frame = Frame(k, 0, time.monotonic_ns(), 0, np.full_like(IMAGE, k))
+            frame = Frame(k, 0, time.monotonic_ns(), 0, np.full(IMAGE.shape, k, np.int32))  # its number, over 255 too
             seen.append(networks.start(frame).result())
             return seen[-1]
 
