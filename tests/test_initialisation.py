@@ -156,8 +156,8 @@ def test_what_changed_is_not_asked_where_the_whole_road_moves() -> None:
 
 
 def test_what_changed_is_looked_for_on_the_farther_road() -> None:
-    past = RoadImage.of(np.zeros((8, 8), np.float32), 4)
-    present = RoadImage.of(np.zeros((8, 8), np.float32), 4)
+    past = RoadImage.from_normalised(np.zeros((8, 8), np.float32), 4)
+    present = RoadImage.from_normalised(np.zeros((8, 8), np.float32), 4)
     present.grey[1:3] = [[5.0], [-6.0]]  # rows 5 and 6 of the image
     present.grey[6:] = 20.0  # a shadow on the near road
     px = np.array([[u, v] for v in range(4, 12) for u in range(8)])
@@ -166,7 +166,7 @@ def test_what_changed_is_looked_for_on_the_farther_road() -> None:
 
 
 def test_of_a_road_of_one_row_nothing_is_farther() -> None:
-    image = RoadImage.of(np.zeros((1, 8), np.float32), 4)
+    image = RoadImage.from_normalised(np.zeros((1, 8), np.float32), 4)
     assert len(far_changed_pixels(image, image, np.array([[u, 4] for u in range(8)]))) == 0
 
 

@@ -123,7 +123,7 @@ def test_a_hidden_road_carries_the_scale_and_a_new_window_forgets_it() -> None:
         assert scale.measure_scale(Pose(np.eye(3), np.array([0.0, 0.0, STEP_M])), hidden) == 1.0
     assert scale.status() == [Status.SCALE_CARRIED]
     scale.restart(GREY, street.window.poses[-1], 0.2)
-    assert scale.unknown
+    assert scale.is_unknown
 
 
 def test_the_key_chooses_the_strategy_and_is_validated(tmp_path: Path) -> None:

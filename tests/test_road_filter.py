@@ -177,10 +177,10 @@ def test_another_length_must_outweigh_those_that_agreed_on_the_one_before(agreed
     confirmation = ScaleConfirmation(RoadScaleConfig())
     for _ in range(agreed):
         confirmation.confirm(1.0, 0.01)
-        assert not confirmation.outweighed
+        assert not confirmation.is_outweighed
     confirmation.confirm(1.0, math.log(0.2))
     count = 1
-    while confirmation.outweighed:
+    while confirmation.is_outweighed:
         confirmation.confirm(1.0, 0.0)
         count += 1
     assert count == needed
@@ -191,23 +191,23 @@ def test_a_weak_comparison_counts_where_two_before_found_the_same_length() -> No
     confirmation.reject(1.0, 3.4)
     confirmation.reject(1.0)
     confirmation.reject(1.0, 0.3)
-    assert not confirmation.found_before(3.45)
+    assert not confirmation.was_found_before(3.45)
     confirmation.reject(1.0, 3.5)
-    assert confirmation.found_before(3.45)
-    assert not confirmation.found_before(0.3)
-    confirmation.agree(1.0)
-    assert not confirmation.found_before(3.45)
+    assert confirmation.was_found_before(3.45)
+    assert not confirmation.was_found_before(0.3)
+    confirmation.add_accepted(1.0)
+    assert not confirmation.was_found_before(3.45)
 
 
 def test_a_known_length_gives_way_to_another_that_two_searches_found_before() -> None:
     """The town film at half size from its 13th second on grew by 30 % at one comparison that correlated by .33."""
     confirmation = ScaleConfirmation(RoadScaleConfig())
-    assert confirmation.may_be(0.3)  # nothing is known
+    assert confirmation.is_plausible(0.3)  # nothing is known
     for _ in range(3):
         confirmation.confirm(1.0, 0.01)
     for _ in range(2):
-        assert not confirmation.may_be(0.3)
+        assert not confirmation.is_plausible(0.3)
         confirmation.reject(1.0, 0.3)
-    assert confirmation.may_be(0.3)
-    assert not confirmation.may_be(-0.3)
-    assert confirmation.may_be(0.05)  # it is the known one
+    assert confirmation.is_plausible(0.3)
+    assert not confirmation.is_plausible(-0.3)
+    assert confirmation.is_plausible(0.05)  # it is the known one

@@ -15,7 +15,7 @@ from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera, plane_normal
 from birdslam.geometry.pose import rotation_exp
 from birdslam.odometry.road.kalman_filter import RoadFilter
-from birdslam.odometry.road.vanishing_point import VanishingPointConfig, VanishingPointDetector, vanishing_point
+from birdslam.odometry.road.vanishing_point import VanishingPointConfig, VanishingPointDetector, fit_vanishing_point
 from birdslam.odometry.scale_config import RoadScaleConfig
 
 CAMERA = Camera(640, 192, 371.2, 371.2, 319.5, 90.0, height_m=1.65)
@@ -43,7 +43,7 @@ def segments(pitch_rad: float, heading_rad: float, curvature_per_m: float = 0.0)
 def test_without_noise_the_pitch_is_exact_from_a_wrong_guess(
     pitch_rad: float, heading_rad: float, off_rad: float
 ) -> None:
-    lines = vanishing_point(CAMERA, CONFIG, segments(pitch_rad, heading_rad), pitch_rad + off_rad, 0.0, 0.0)
+    lines = fit_vanishing_point(CAMERA, CONFIG, segments(pitch_rad, heading_rad), pitch_rad + off_rad, 0.0, 0.0)
     assert lines is not None
     normal = plane_normal(pitch_rad, 0.0)[0]
     assert abs(float(normal @ lines.direction)) < 0.1 * lines.sigma_rad
@@ -60,7 +60,7 @@ def test_segments_of_other_directions_do_little() -> None:
         road = road + rng.normal(0.0, CONFIG.sigma_px, road.shape)
         start = rng.uniform([0.0, 120.0], [639.0, 190.0], (8, 2))
         others = np.stack([start, start + rng.normal(0.0, 25.0, (8, 2))], axis=1)
-        lines = vanishing_point(CAMERA, CONFIG, np.concatenate([road, others]), -0.01, 0.0, 0.0)
+        lines = fit_vanishing_point(CAMERA, CONFIG, np.concatenate([road, others]), -0.01, 0.0, 0.0)
         if lines is not None:
             off.append(abs(float(plane_normal(0.01, 0.0)[0] @ lines.direction)) / lines.sigma_rad)
     assert len(off) > 40
@@ -70,7 +70,7 @@ def test_segments_of_other_directions_do_little() -> None:
 @pytest.mark.parametrize("curvature_per_m", [0.0008, -0.0008])
 def test_in_a_sag_the_lines_meet_higher(curvature_per_m: float) -> None:
     """Where they lead lies in the road at the distance that is told."""
-    lines = vanishing_point(CAMERA, CONFIG, segments(0.01, 0.0, curvature_per_m), 0.01, 0.0, 0.0)
+    lines = fit_vanishing_point(CAMERA, CONFIG, segments(0.01, 0.0, curvature_per_m), 0.01, 0.0, 0.0)
     assert lines is not None
     there = plane_normal(0.01 + curvature_per_m * lines.distance_m, 0.0)[0]
     assert abs(float(there @ lines.direction)) < lines.sigma_rad
@@ -78,10 +78,10 @@ def test_in_a_sag_the_lines_meet_higher(curvature_per_m: float) -> None:
 
 def test_too_few_lines_say_nothing() -> None:
     every = segments(0.01, 0.0)
-    assert vanishing_point(CAMERA, CONFIG, every[:0], 0.01, 0.0, 0.0) is None
-    assert vanishing_point(CAMERA, CONFIG, every[:3], 0.01, 0.0, 0.0) is None
+    assert fit_vanishing_point(CAMERA, CONFIG, every[:0], 0.01, 0.0, 0.0) is None
+    assert fit_vanishing_point(CAMERA, CONFIG, every[:3], 0.01, 0.0, 0.0) is None
     level = np.array([[[100.0, v], [500.0, v]] for v in range(120, 180, 4)])  # across the road
-    assert vanishing_point(CAMERA, CONFIG, level, 0.01, 0.0, 0.0) is None
+    assert fit_vanishing_point(CAMERA, CONFIG, level, 0.01, 0.0, 0.0) is None
 
 
 def painted(pitch_rad: float) -> NDArray[np.uint8]:
@@ -126,7 +126,7 @@ def test_lines_that_meet_nowhere_are_no_roads(seed: int) -> None:
     rng = np.random.default_rng(seed)
     start = rng.uniform([0.0, 110.0], [639.0, 190.0], (40, 2))
     every = np.stack([start, start + rng.normal(0.0, 25.0, (40, 2))], axis=1)
-    assert vanishing_point(CAMERA, CONFIG, every, 0.0, 0.0, 0.0) is None
+    assert fit_vanishing_point(CAMERA, CONFIG, every, 0.0, 0.0, 0.0) is None
 
 
 def test_lines_of_vehicles_do_not_count() -> None:
@@ -136,13 +136,13 @@ def test_lines_of_vehicles_do_not_count() -> None:
 
 def test_the_filter_takes_the_pitch_of_lines_and_refuses_what_is_far_off() -> None:
     filter_ = RoadFilter(CAMERA, RoadScaleConfig())
-    lines = vanishing_point(CAMERA, CONFIG, segments(0.02, 0.0), 0.0, 0.0, 0.0)
+    lines = fit_vanishing_point(CAMERA, CONFIG, segments(0.02, 0.0), 0.0, 0.0, 0.0)
     assert lines is not None
     before = float(filter_.cov[1, 1])
     assert filter_.update_vanishing_point(lines)
     assert filter_.tilt[0] == pytest.approx(0.02, abs=0.003)
     assert filter_.cov[1, 1] < 0.1 * before
-    far = vanishing_point(CAMERA, CONFIG, segments(0.02 + math.radians(3.0), 0.0), 0.05, 0.0, 0.0)
+    far = fit_vanishing_point(CAMERA, CONFIG, segments(0.02 + math.radians(3.0), 0.0), 0.05, 0.0, 0.0)
     assert far is not None
     x, cov = filter_.x.copy(), filter_.cov.copy()
     assert not filter_.update_vanishing_point(far)

@@ -35,7 +35,7 @@ class RoadView:
     interval_ns: tuple[int, int] = (0, 0)  # start and end of the motion, t_source_ns
     sigma_across_m: float = 0.0  # 1-sigma of the lateral position, from the resection
     sigma_rotation_rad: float = 0.0  # 1-sigma of the rotation, from the resection
-    on_glass: bool = False  # corners are fixed to the windscreen
+    has_fixed_corners: bool = False  # corners are fixed to the windscreen
 
 
 class MetricScale(Protocol):
@@ -61,16 +61,16 @@ class MetricScale(Protocol):
         """(2, 2) covariance of the ground's pitch and roll."""
 
     @property
-    def unknown(self) -> bool:
+    def is_unknown(self) -> bool:
         """Whether the scale is too uncertain to drive by."""
 
     def restart(self, grey: NDArray[np.uint8], pose: Pose, sigma_rel: float) -> None:
         """Restarts with a new window at this image, whose scale has a 1-sigma of `sigma_rel`."""
 
-    def speed_predicted(self, sigma_rel: float) -> None:
+    def add_predicted_motion(self, sigma_rel: float) -> None:
         """Raises the 1-sigma of the scale to `sigma_rel`, after a motion whose length the velocity prior gave."""
 
-    def lose_tilt(self) -> None:
+    def reset_tilt(self) -> None:
         """Resets the tilt to the prior of the mount, after a rotation that was not observed."""
 
     def add_readings(self, readings: Iterable[SpeedReading], t_source_ns: int) -> None:

@@ -105,7 +105,7 @@ class MotionRecords:
             sources = (SpeedSource.CAR,)
         elif Status.ODOMETRY_COASTING in status:
             sources = (SpeedSource.CARRIED,)
-        if car_sigma_rel is None and scale.unknown and Status.SCALE_INVALID not in status:
+        if car_sigma_rel is None and scale.is_unknown and Status.SCALE_INVALID not in status:
             status = [*status, Status.SCALE_INVALID]  # stationary or coasting at an unknown scale
         return Motion(
             from_frame=frames[0],

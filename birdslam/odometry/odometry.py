@@ -187,22 +187,22 @@ class Odometry:
         if not self._has_reference_image:
             motion = self._coast(frame_id, dt_s, [], car)
             self._start_window(tracks, frame_id, t_source_ns, boxes_px)
-            self._scale.lose_tilt()
+            self._scale.reset_tilt()
             return motion
 
         cfg = self.config
         self._standstill.near_road.update(tracks.image, t_source_ns, boxes_px)
         corners, pose_estimate = self._estimate_pose(tracks, boxes_px, dt_s, car)
-        on_glass = corners.ids[corners.fixed]
+        fixed_ids = corners.ids[corners.fixed]
         flow_px = near_road_flow_px(
-            self.camera, self._scale.ground, self._tracker.reference, tracks, boxes_px, on_glass
+            self.camera, self._scale.ground, self._tracker.reference, tracks, boxes_px, fixed_ids
         )
         speed_mps = self._model.speed_mps
         stationary = pose_estimate is not None and self._standstill.is_stationary(
             self._pose.between(pose_estimate[0]), corners.displacement_px, flow_px, speed_mps, dt_s, car
         )
         if (stationary or self._seems_still(corners)) and self._standstill.needs_proof(
-            stationary, self._scale.unknown, self._selector.obstructed, speed_mps, dt_s, car
+            stationary, self._scale.is_unknown, self._selector.obstructed, speed_mps, dt_s, car
         ):
             if not self._standstill.near_road.proven:
                 return self._coast_unproven(tracks, frame_id, t_source_ns, boxes_px, dt_s, car)
@@ -216,7 +216,7 @@ class Odometry:
             if is_slipping or dt_s > cfg.max_coast_s or len(corners.displacement_px) < cfg.min_fitting:
                 # The image has no link to the reference: the window restarts at the coasted pose
                 self._start_window(tracks, frame_id, t_source_ns, boxes_px)
-                self._scale.lose_tilt()
+                self._scale.reset_tilt()
             return motion
         pose, info = pose_estimate
         if is_night(tracks.image):
@@ -240,12 +240,12 @@ class Odometry:
                 corners.xy,
                 relative_sigma_m if np.isfinite(predicted_sigma_m) else np.inf,
             )
-            if not self._scale.unknown:
+            if not self._scale.is_unknown:
                 self._selector.reject_below_plane(self._window, pose, self._scale.ground)
             pose = self._window.refine()
             if np.isfinite(predicted_sigma_m):
                 step_length = float(np.linalg.norm(pose.p - self._pose.p))
-                self._scale.speed_predicted(predicted_sigma_m / max(step_length, predicted_sigma_m))
+                self._scale.add_predicted_motion(predicted_sigma_m / max(step_length, predicted_sigma_m))
             cov6 = step_cov(cfg.motion, info)
             metric_step = self._scale_to_metres(pose, cov6, tracks, boxes_px, road_mask, flow_px, interval_ns)
             if self._shutter.readout_s and self._model.known:
@@ -359,7 +359,7 @@ class Odometry:
             interval_ns,
             sigma_across_m=float(np.hypot(*sigma[:2])) / np.sqrt(2.0),
             sigma_rotation_rad=float(np.linalg.norm(sigma[3:])) / np.sqrt(3.0),
-            on_glass=self._selector.obstructed,
+            has_fixed_corners=self._selector.obstructed,
         )
         factor = self._scale.measure_scale(step, view)
         self._window.rescale(factor)
@@ -380,14 +380,14 @@ class Odometry:
         motion = self._coast(frame_id, dt_s, [Status.VIEW_OBSTRUCTED] * obstructed, car)
         if self._standstill.held_too_long(dt_s):
             self._start_window(tracks, frame_id, t_source_ns, boxes_px)
-            self._scale.lose_tilt()
+            self._scale.reset_tilt()
         return motion
 
     def _is_moving(self, car: CarMotion | None) -> bool:
         """Whether the car is certain to move, by its own speed or by its last motion at a known scale."""
         if car is not None:
             return car.proven and car.is_moving(MOVING_M)
-        return not self._scale.unknown and self._model.speed_mps > _MIN_MOVING_MPS
+        return not self._scale.is_unknown and self._model.speed_mps > _MIN_MOVING_MPS
 
     def _apply_velocity_prior(self, pose: Pose, info: Floats, dt_s: float) -> tuple[Pose, Floats, float]:
         """The pose, its information (6, 6), and 1-sigma of its position by the velocity prior (inf if not used)."""

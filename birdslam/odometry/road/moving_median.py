@@ -1,9 +1,8 @@
-"""The paper's metric scale: a moving median over the scales by the road points of each frame (Sec. 3.1).
+"""The paper's metric scale: a moving median over the scales of frames (Sec. 3.1).
 
-The road is the calibrated plane (the paper's flat-earth assumption). A landmark on it has a depth in the odometry's
-unit, and by Eq. 1 one in metres: the median of their ratios is the frame's scale. The paper states no window's width;
-the default is 21 frames, 2 s at 10 Hz: wrong scales must last for a second to win, and in 20 m of a street in town the
-visual scale drifts by little.
+The road is the calibrated plane (flat-earth assumption). A landmark on it has a depth in the scale of the window and,
+by Eq. 1, in metres; the median ratio is the frame's scale. The paper states no width of the median; the default is 21
+frames, 2 s at 10 Hz.
 """
 
 from __future__ import annotations
@@ -32,8 +31,8 @@ _SIGMA_OF_MEDIAN = 1.4826 * 1.2533  # times the median absolute deviation over t
 class MovingMedianScale:
     """A `metric_scale.MetricScale`.
 
-    State: the last `median_frames` scales (metres per scale of the window as it began), and the last median.
-    Measurements: one scale a frame, from the window's landmarks on the road. Readers: `Odometry`.
+    State: the last `median_frames` scales (metres per initial scale of the window), and the last median.
+    Measurements: one scale per frame, from the window's landmarks on the road. Reader: `Odometry`.
     """
 
     def __init__(self, camera: Camera, config: RoadScaleConfig) -> None:
@@ -42,11 +41,11 @@ class MovingMedianScale:
         self.vanishing_point: VanishingPoint | None = None  # always None: not measured
         self._scales: deque[float] = deque(maxlen=config.median_frames)
         self._last_scale = 1.0
-        self._carried_m = 0.0  # travelled since a frame gave a scale
+        self._carried_m = 0.0  # travelled since the last scale of a frame
 
     @property
     def bonnet_px(self) -> None:
-        """None: not looked for."""
+        """None: bonnets are not detected."""
 
     @property
     def ground(self) -> GroundPlane:
@@ -55,12 +54,12 @@ class MovingMedianScale:
 
     @property
     def tilt_cov(self) -> NDArray[np.float64]:
-        """The body pitches and rolls about the calibrated plane, which is not measured here."""
+        """Prior of the body's pitch and roll; they are not measured."""
         return np.eye(2) * (self.config.sigma_mount_rad**2 + self.config.sigma_bounce_rad**2)
 
     @property
     def sigma_rel(self) -> float:
-        """Of the moving median, by the spread of its scales; 1 before there are enough."""
+        """Relative 1-sigma of the moving median, from the spread of its scales; 1 before there are enough."""
         if len(self._scales) < self.config.confirmations:
             return 1.0
         log_scales = np.log(self._scales)
@@ -69,19 +68,19 @@ class MovingMedianScale:
         return float(np.clip(sigma, self.config.sigma_scale_floor_rel, 1.0))
 
     @property
-    def unknown(self) -> bool:
-        """Too vague to be driven by."""
+    def is_unknown(self) -> bool:
+        """Whether the scale is too uncertain to drive by."""
         return self.sigma_rel > self.config.invalid_sigma_rel
 
     def restart(self, grey: NDArray[np.uint8], pose: Pose, sigma_rel: float) -> None:
-        """A new window has a new scale: the scales of the old one are dropped."""
+        """Drops the scales of the old window."""
         self._scales.clear()
         self._last_scale = 1.0
 
-    def speed_predicted(self, sigma_rel: float) -> None:
-        """Does nothing: the median's own spread is its uncertainty."""
+    def add_predicted_motion(self, sigma_rel: float) -> None:
+        """Does nothing: the spread of the median is its uncertainty."""
 
-    def lose_tilt(self) -> None:
+    def reset_tilt(self) -> None:
         """Does nothing: the tilt is not estimated."""
 
     def add_readings(self, readings: Iterable[SpeedReading], t_source_ns: int) -> None:
@@ -91,12 +90,12 @@ class MovingMedianScale:
         """None: the paper uses the road alone."""
 
     def car_status(self) -> list[Status]:
-        """Nothing: the paper uses the road alone."""
+        """Empty: the paper uses the road alone."""
         return []
 
     @property
     def sources(self) -> tuple[SpeedSource, ...]:
-        """The road, or an older scale of it."""
+        """The road, or a carried scale."""
         return (SpeedSource.CARRIED if Status.SCALE_CARRIED in self.status() else SpeedSource.ROAD,)
 
     @property
@@ -105,7 +104,7 @@ class MovingMedianScale:
         return 1.0
 
     def measure_scale(self, step: Pose, view: RoadView) -> float:
-        """The change of the moving median; 1 where no frame has given a scale yet."""
+        """Change of the moving median; 1 before the first scale."""
         self._carried_m += float(np.linalg.norm(step.p))
         scale = self.frame_scale(view)
         if scale is not None:
@@ -117,7 +116,7 @@ class MovingMedianScale:
         return self._last_scale / last
 
     def frame_scale(self, view: RoadView) -> float | None:
-        """Metres per present scale by this image's landmarks on the road; None where there are too few."""
+        """Metres per current scale, from the landmarks of this image on the road; None if there are too few."""
         config, window = self.config, view.window
         seen = np.isfinite(window.obs[-1, :, 0]) & (window.rho_sigma < config.median_sigma_depth_rel * window.rho)
         px = self.camera.to_px(window.obs[-1, seen])
@@ -128,10 +127,10 @@ class MovingMedianScale:
         return float(np.median(ratio[used])) if used.sum() >= config.median_landmarks else None
 
     def status(self) -> list[Status]:
-        """Whether the scale is an older one, or not known."""
+        """Whether the scale is carried or invalid."""
         out = []
         if self._carried_m > self.config.carried_after_m or len(self._scales) < self.config.confirmations:
             out.append(Status.SCALE_CARRIED)
-        if self.unknown:
+        if self.is_unknown:
             out.append(Status.SCALE_INVALID)
         return out

@@ -1,4 +1,4 @@
-"""Image points on the road, which the paper uses for static map and scale (Sec. 3.1), and outside vehicles."""
+"""Selection of image points on the road (Sec. 3.1) and outside vehicles."""
 
 from __future__ import annotations
 
@@ -13,19 +13,18 @@ Bools = NDArray[np.bool_]
 
 MAX_DISTANCE_M = 30.0
 _BESIDE_PX, _BELOW_PX = 3, 6  # a box ends above its vehicle's shadow
-# By night a vehicle's lamps glow beyond its box, within reach of a corner's tracking window: half of 8 x 20 px, twice
-# that across in the pyramid's next level. On rendered nights 5 px keep such corners, 8 px none
+# At night a vehicle's lamps glow beyond its box, within the tracking window of a corner
 _GLOW_BESIDE_PX, _GLOW_ABOVE_PX = 8, 10
-_DARK_GREY = 55.0  # the two rendered nights have a mean of 29 to 38, KITTI 00, 01, 06, 0005 and the raw clip 83 to 144
+_DARK_GREY = 55.0  # mean grey value of an image at night, at most
 
 
 def is_night(grey: NDArray[np.uint8]) -> bool:
-    """Whether an image (H, W) is so dark that lamps glow in it."""
+    """Whether an image (H, W) is so dark that lamps glow."""
     return float(grey[::8, ::8].mean()) < _DARK_GREY
 
 
 def outside(px: Floats, boxes_px: Floats, night: bool = False) -> Bools:
-    """(N,) which of the pixels (N, 2) lie outside all vehicles' boxes (B, 4); by night, their lamps' glow."""
+    """(N,) which of the pixels (N, 2) lie outside all boxes (B, 4), at night with a margin for glow."""
     beside_px, above_px, below_px = _BESIDE_PX, _BESIDE_PX, _BELOW_PX
     if night:
         beside_px, above_px, below_px = _GLOW_BESIDE_PX, _GLOW_ABOVE_PX, _GLOW_ABOVE_PX
@@ -39,7 +38,7 @@ def outside(px: Floats, boxes_px: Floats, night: bool = False) -> Bools:
 def on_road(
     px: Floats, camera: Camera, ground: GroundPlane, boxes_px: Floats, road_mask: Bools | None, half_width_m: float
 ) -> Bools:
-    """(N,) which of the pixels (N, 2) show road: in the mask (H, W), else in a strip in front; outside vehicles."""
+    """(N,) which of the pixels (N, 2) show road, by the mask (H, W) or else a strip ahead; outside boxes (B, 4)."""
     rays = rays_cam(camera, px)
     rho = -(rays @ ground.normal_cam) / camera.height_m  # inverse depth on the road, Eq. 1
     keep = (rho > 1.0 / MAX_DISTANCE_M) & outside(px, boxes_px)

@@ -1,4 +1,4 @@
-"""The road in one image, with its local brightness and contrast normalised, and its gradients."""
+"""Image of the road with normalised local brightness and contrast, and its gradients."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ Grey = NDArray[np.float32]
 class RoadImage:
     """The part of a grey image that can show road, with local brightness and contrast normalised.
 
-    Otherwise the edges of shadows, and of the dark below other cars, outweigh the road's texture. The contrast over
-    `window_px` is raised by `floor_grey`, so that noise on smooth road is not amplified.
+    Otherwise edges of shadows outweigh the texture of the road. `floor_grey` is added to the contrast over `window_px`,
+    so that noise on smooth road is not amplified.
     """
 
     def __init__(self, grey: NDArray[np.uint8], top_px: int, window_px: int, floor_grey: float) -> None:
@@ -30,15 +30,15 @@ class RoadImage:
         self._gradients: tuple[Grey, Grey] | None = None
 
     @classmethod
-    def of(cls, grey: Grey, top_px: int) -> RoadImage:
-        """Of rows from `top_px` on that are not to be normalised."""
+    def from_normalised(cls, grey: Grey, top_px: int) -> RoadImage:
+        """Image of rows from `top_px` on that are already normalised."""
         image = cls.__new__(cls)
         image.top_px, image.grey, image._gradients = top_px, grey, None
         return image
 
     @property
     def gradients(self) -> tuple[Grey, Grey]:
-        """d grey / du and d grey / dv, grey levels per pixel."""
+        """d grey / du and d grey / dv (grey levels per pixel)."""
         if self._gradients is None:
             self._gradients = (
                 cv2.Scharr(self.grey, cv2.CV_32F, 1, 0, scale=1.0 / 32.0),

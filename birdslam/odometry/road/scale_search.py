@@ -1,8 +1,8 @@
-"""The search for an unknown length: by the landmarks on the road, and by correlation of the road's image.
+"""Search for an unknown length, by landmarks on the road and by correlation of the road's image.
 
-An alignment (alignment.py) converges only from within the size of the road's texture; a search gives it a start.
-Landmarks on the road give a length that is short by up to a tenth (see alignment.py), but no reflection on the
-windscreen, which has no depth, and no period of stripes can fake it. So they bound the alignments that are accepted.
+An alignment (alignment.py) converges only within the size of the road's texture; the search initializes it. Landmarks
+give a length that is up to a tenth too short, but reflections and periodic stripes do not affect it. So they bound the
+accepted alignments.
 """
 
 from __future__ import annotations
@@ -24,29 +24,27 @@ from birdslam.odometry.road.road_image import RoadImage
 
 Floats = NDArray[np.float64]
 
-_LENGTHS_M = np.geomspace(0.03, 6.0, 84)  # candidates, where the length is not known at all
-_STATIONARY_M = 0.1  # a shorter motion at a start counts as none
-_MIN_LEAD = 0.1  # of the changed pixels' correlation in motion over that at standstill
-# Of landmarks on the road: a lane and its neighbours; the depth's relative sigma; the mode's width, by tilt and crown
+_LENGTHS_M = np.geomspace(0.03, 6.0, 84)  # candidates of an unknown length
+_STATIONARY_M = 0.1  # a shorter motion is a standstill
+_MIN_LEAD = 0.1  # of the changed pixels' correlation over that at standstill
+# Landmarks on the road: area of a lane and its neighbours, maximum sigma of the depth, width of the mode
 _ROAD_NEAR_M, _ROAD_FAR_M, _ROAD_HALF_WIDTH_M = 3.0, 30.0, 6.0
 _DEPTH_SIGMA_REL = 0.25
 _MODE_WIDTH_LOG = 0.1
 _MIN_VOTES, _MIN_VOTE_SHARE = 6.0, 0.45
 _MODE_GRID_LOG = np.linspace(-4.0, 4.0, 321)
-# Of the log length: landmarks are short by up to a tenth, and a pitch that is off by a degree makes another fifth
+# Tolerances of the log length: landmarks are up to a tenth short, and a pitch error of a degree adds a fifth
 _LANDMARK_GATE, _AGREEMENT_GATE = 0.4, 0.15
-# A search that leaves the length this vague, without landmarks that agree, has found none: drops over a rendered
-# motorway that seem to stand leave 0.8, right lengths there and behind a coarse encoder less than 0.4
-_MAX_SIGMA_LOG = 0.5
+_MAX_SIGMA_LOG = 0.5  # of a length from a search, unless the landmarks agree
 
 
 @dataclass(frozen=True)
 class LengthSearch:
-    """How a doubtful scale is searched for."""
+    """Parameters of the search for a doubtful scale."""
 
     tilt: tuple[float, float]  # (pitch, roll) in rad
-    lead: float  # of the correlation, by which a searched length must beat the expected one
-    tilt_sigma_rad: float  # by which the tilt's prior is widened
+    lead: float  # minimum difference of the correlation to that at the predicted length
+    tilt_sigma_rad: float  # added to the prior of the tilt
 
 
 def best_alignment(
@@ -61,10 +59,10 @@ def best_alignment(
     search: LengthSearch | None,
     readout_share: float = 0.0,
 ) -> tuple[RoadFit, float, Floats] | None:
-    """The fit, the factor on T_past_present that it starts from, and the filter's covariance to be joined with it.
+    """Returns the best fit, the factor on T_past_present that it starts from, and the filter's covariance for it.
 
-    The alignment starts from the expected length and, with a `search`, from the searched one and that `by_landmarks`.
-    Fits that the landmarks contradict are dropped; None where none is left. `readout_share` as of `RoadAligner.align`.
+    The alignment starts from the predicted length and, with a `search`, from the searched one and `by_landmarks`. Fits
+    that the landmarks contradict are dropped; None if none is left. `readout_share` as in `RoadAligner.align`.
     """
     (prior, predicted_cov), prior_cov = filter_.prediction, filter_.cov.copy()
     fit = aligner.align(past, present, T, px, prior, predicted_cov, sigma_motion, readout_share)
@@ -95,17 +93,17 @@ def best_alignment(
 
 
 def _is_vague(fit: RoadFit) -> bool:
-    """Whether a search has found no length: by the images' gradients, or since other lengths are as likely."""
+    """Whether a search found no length, by the image gradients or since other lengths are as likely."""
     return fit.cov[0, 0] > _MAX_SIGMA_LOG**2 or fit.length_information < _MAX_SIGMA_LOG**-2
 
 
 def _contradicts(log_length: float, by_landmarks: float | None) -> bool:
-    """Whether a factor on the lengths is farther from that of the landmarks than their errors allow."""
+    """Whether a log factor on the lengths is inconsistent with the factor of the landmarks."""
     return by_landmarks is not None and abs(log_length - float(np.log(by_landmarks))) > _LANDMARK_GATE
 
 
 def agrees(log_length: float, by_landmarks: float | None) -> bool:
-    """Whether the landmarks on the road confirm a factor on the lengths."""
+    """Whether the landmarks on the road confirm a log factor on the lengths."""
     return by_landmarks is not None and abs(log_length - float(np.log(by_landmarks))) <= _AGREEMENT_GATE
 
 
@@ -118,10 +116,10 @@ def search_length(
     tilt: tuple[float, float],
     lengths: Floats,
 ) -> float:
-    """The one of `lengths` (L,) in metres with the best correlation on a flat road, over three pitches about `tilt`.
+    """Returns that of `lengths` (L,) in metres with the best correlation on a flat road, over three pitches.
 
-    `px` (N, 2) are pixels of the present image that show road, `tilt` is (pitch, roll) in rad; of `T_past_present`'s
-    translation only the direction counts.
+    `px` (N, 2) are pixels of the current image that show road, `tilt` is (pitch, roll) in rad. Only the direction of
+    the translation of `T_past_present` is used.
     """
     px = px[:: max(1, len(px) // 900)]
     tilts = [(pitch_rad, tilt[1]) for pitch_rad in (tilt[0] - 0.01, tilt[0], tilt[0] + 0.01)]
@@ -139,9 +137,9 @@ def search_length(
 def best_correlation(correlate: Callable[[bool], Floats], lengths: Floats) -> tuple[int, int]:
     """Indices of the pitch and of the length, of `lengths` (L,) ascending in metres, with the best correlation.
 
-    `correlate(changed)` gives correlations (pitches, L) over the whole road, or over its changed far pixels. If the car
-    stands, no length explains the changed pixels. Where one does, what correlates at standstill is no road: the car's
-    bonnet, or grain that a video encoder left where it was.
+    `correlate(changed)` returns correlations (pitches, L) over the whole road, or over its changed far pixels. No
+    length explains the changed pixels of a stationary car. If one does, the bonnet or encoder artifacts correlate at
+    standstill.
     """
     by_road = correlate(False)
     pitch, length = np.unravel_index(int(by_road.argmax()), by_road.shape)
@@ -154,8 +152,7 @@ def best_correlation(correlate: Callable[[bool], Floats], lengths: Floats) -> tu
 
 
 def far_changed_pixels(past: RoadImage, present: RoadImage, px: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Of the pixels (N, 2) of the present image's road: the half of the farther half that differs most from the same
-    pixels of the past image."""
+    """The most changed half of the farther half of the road's pixels (N, 2) in the current image."""
     far = px[px[:, 1] < np.median(px[:, 1])]
     then, now = (image.grey[far[:, 1] - image.top_px, far[:, 0]] for image in (past, present))
     change = np.abs(now - then)
@@ -171,7 +168,7 @@ def correlations(
     px: NDArray[np.int64],
     tilt: tuple[float, float],
 ) -> Floats:
-    """(L,) correlation of the road's samples (N, 2) with the past image, for each of the translations (L, 3)."""
+    """(L,) correlation of the road's pixels (N, 2) with the past image, for each of the translations (L, 3)."""
     f32 = np.float32
     focal_px, centre_px = [camera.fx_px, camera.fy_px], [camera.cx_px, camera.cy_px]
     rays = np.stack([*((px - centre_px) / focal_px).T, np.ones(len(px))]).astype(f32)
@@ -189,14 +186,14 @@ def correlations(
     ab, aa, bb = (np.einsum("ij,ij->i", *pair) for pair in ((a, b), (a, a), (b, b)))
     variances = (aa - count * mean_a**2) * (bb - count * mean_b**2)
     out: Floats = (ab - count * mean_a * mean_b) / np.sqrt(np.maximum(variances, 1e-9))
-    out[count < 0.5 * len(px)] = -1.0  # what leaves the image says nothing
+    out[count < 0.5 * len(px)] = -1.0  # most pixels leave the image
     return out
 
 
 def scale_from_landmarks(camera: Camera, tilt: tuple[float, float], window: SlidingWindow) -> float | None:
-    """Metres in the scale of the window, by the mode of the camera's height over the landmarks on the road ahead.
+    """Metres per scale of the window, from the mode of the camera's height over the landmarks on the road.
 
-    `tilt` is (pitch, roll) in rad. None where too few landmarks agree on one height.
+    `tilt` is (pitch, roll) in rad. None if too few landmarks agree on one height.
     """
     seen = np.isfinite(window.obs[-1, :, 0]) & np.isfinite(window.rho) & (window.rho > 1e-6)
     seen &= window.rho_sigma < _DEPTH_SIGMA_REL * window.rho

@@ -44,16 +44,16 @@ class ZeroVelocityConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True
 
 
 def near_road_flow_px(
-    camera: Camera, ground: GroundPlane, reference: Tracks, tracks: Tracks, boxes_px: Floats, on_glass: Ints = _NO_IDS
+    camera: Camera, ground: GroundPlane, reference: Tracks, tracks: Tracks, boxes_px: Floats, fixed_ids: Ints = _NO_IDS
 ) -> float | None:
     """Optical flow of the reference image's corners on the near road, third quartile; None where there are too few.
 
-    `boxes_px` (N, 4) are vehicles, `on_glass` (M,) the ids of fixed corners, which do not count. Infinite where most
+    `boxes_px` (N, 4) are vehicles, `fixed_ids` (M,) the ids of fixed corners, which do not count. Infinite where most
     corners were lost: a stationary car would have kept them.
     """
     rays = rays_cam(camera, reference.px)
     near = (rays @ ground.normal_cam < -camera.height_m / _NEAR_M) & outside(reference.px, boxes_px)
-    near &= ~np.isin(reference.ids, on_glass)
+    near &= ~np.isin(reference.ids, fixed_ids)
     if near.sum() < _MIN_NEAR:
         return None
     a, b = match_ids(reference.ids[near], tracks.ids)
