@@ -238,7 +238,7 @@ def test_a_wrong_speed_is_refused_and_told_where_the_road_is_seen(
     told = world.drive(speed, wrong, (1.0, 12.0), road=True)
     assert status in told
     assert abs(world.error) < 0.02
-    assert not world.car.measures
+    assert not world.car.is_measuring
 
 
 def test_a_unit_of_length_that_the_images_lost_is_the_cars_again_where_no_road_says_otherwise() -> None:
@@ -248,7 +248,7 @@ def test_a_unit_of_length_that_the_images_lost_is_the_cars_again_where_no_road_s
     told = world.drive(lambda t: 12.0, readings, (10.0, 20.0), road=False)
     assert told == [Status.CAR_SPEED_IMPLAUSIBLE]
     assert world.error == pytest.approx(0.0, abs=0.01)
-    assert world.car.measures
+    assert world.car.is_measuring
 
 
 def test_a_number_that_stops_changing_is_no_reading_any_more() -> None:
@@ -269,10 +269,10 @@ def test_a_road_that_speaks_thrice_against_the_readings_bars_them() -> None:
     world = World()
     world.drive(lambda t: 12.0, readings_of(lambda t: 18.0, 6.0), (1.0, 5.0), road=False)
     for _ in range(2):
-        world.car.road_contradicts(-0.4)
-    assert world.car.trusted
-    world.car.road_contradicts(-0.42)
-    assert not world.car.trusted
+        world.car.add_contradiction(-0.4)
+    assert world.car.is_trusted
+    world.car.add_contradiction(-0.42)
+    assert not world.car.is_trusted
     assert Status.CAR_SPEED_IMPLAUSIBLE in world.car.status()
     assert world.car.motion(4 * NS_PER_S, 5 * NS_PER_S) is None
 

@@ -16,7 +16,7 @@ from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.standing import DECIDED, GIVEN_UP, STANDING_MPS, decide, judge, reported_velocities
 from birdslam.graph.vehicles import VehicleNode
 from birdslam.graph.weights import WeightsConfig
-from birdslam.odometry.speed.standing import StandingDetector
+from birdslam.odometry.speed.standstill import StandstillDetector
 from birdslam.odometry.speed.stillness import StillnessConfig
 from birdslam.odometry.speed.zero_velocity import ZeroVelocityConfig
 from birdslam.types import EgoEdge, Measurements, Moves, VehicleEdge, VehicleEstimate
@@ -201,34 +201,34 @@ def test_an_error_of_the_size_is_not_averaged_away() -> None:
 STILL_PX, PX_PER_M, DT_S = ZeroVelocityConfig().still_px, 10.0, 0.03
 
 
-def ego_that_drove(speed_mps: float, seconds: float = 1.0) -> StandingDetector:
-    standing = StandingDetector(KITTI, ZeroVelocityConfig(), StillnessConfig(), 8)
+def ego_that_drove(speed_mps: float, seconds: float = 1.0) -> StandstillDetector:
+    standing = StandstillDetector(KITTI, ZeroVelocityConfig(), StillnessConfig(), 8)
     for step_m in [3.0 * STILL_PX / PX_PER_M + 0.1] + [speed_mps * DT_S] * round(seconds / DT_S):
-        standing.moved(np.full(20, PX_PER_M * step_m), step_m, DT_S)
+        standing.add_motion(np.full(20, PX_PER_M * step_m), step_m, DT_S)
     return standing
 
 
 @given(st.floats(0.05, 20.0))
 def test_a_stop_is_told_once_the_last_speed_would_have_shown(speed_mps: float) -> None:
     standing, sigmas_m = ego_that_drove(speed_mps), []
-    while (sigma_m := standing.stood(DT_S)) and len(sigmas_m) < 100:
+    while (sigma_m := standing.add_unmoved(DT_S)) and len(sigmas_m) < 100:
         sigmas_m.append(sigma_m)
     would_move_px = PX_PER_M * speed_mps * DT_S * (len(sigmas_m) + 1)
     assert would_move_px > 2.7 * STILL_PX or len(sigmas_m) * DT_S > 0.45
     assert PX_PER_M * speed_mps * DT_S * len(sigmas_m) < 3.3 * STILL_PX
     assert len(sigmas_m) * DT_S < 0.55
     assert all(np.diff(sigmas_m) < 0.0)
-    assert standing.stood(DT_S) == 0.0
+    assert standing.add_unmoved(DT_S) == 0.0
 
 
 def test_what_was_not_seen_to_move_is_made_up_for_by_the_next_motion() -> None:
     standing, speed_mps = ego_that_drove(0.2), 0.2
-    covered = [standing.stood(DT_S) for _ in range(4)]
-    over_s, earlier_m = standing.moved(np.full(20, 0.3), 5 * speed_mps * DT_S, DT_S)
+    covered = [standing.add_unmoved(DT_S) for _ in range(4)]
+    over_s, earlier_m = standing.add_motion(np.full(20, 0.3), 5 * speed_mps * DT_S, DT_S)
     assert all(speed_mps * DT_S < 2.0 * sigma_m for sigma_m in covered)
     assert over_s == pytest.approx(5 * DT_S)
     assert earlier_m == pytest.approx(4 * speed_mps * DT_S)
 
 
 def test_an_ego_that_never_moved_stands_at_once() -> None:
-    assert StandingDetector(KITTI, ZeroVelocityConfig(), StillnessConfig(), 8).stood(DT_S) == 0.0
+    assert StandstillDetector(KITTI, ZeroVelocityConfig(), StillnessConfig(), 8).add_unmoved(DT_S) == 0.0

@@ -61,7 +61,7 @@ def watched(
         image = behind_drops(road_image(speed_mps * k / rate_hz, contrast_grey), count=drops)
         grey = shown(image, rng, gain=1.0 + drift * k / rate_hz)
         stillness.update(grey, round(k / rate_hz * 1e9), NO_BOXES)
-        proven.append(stillness.proven)
+        proven.append(stillness.is_proven)
     return stillness, proven
 
 
@@ -69,7 +69,7 @@ def watched(
 @pytest.mark.parametrize("drops", [0, 500])
 def test_a_car_that_stands_is_told_after_a_second_and_not_before(rate_hz: float, drops: int) -> None:
     stillness, proven = watched(0.0, rate_hz, 20.0, drops, drift=0.02)
-    assert not stillness.contradicted
+    assert not stillness.is_contradicted
     first = proven.index(True) / rate_hz
     assert 0.85 <= first <= 1.1
     assert all(proven[proven.index(True) :])
@@ -80,19 +80,19 @@ def test_a_car_that_stands_is_told_after_a_second_and_not_before(rate_hz: float,
 def test_a_car_that_drives_behind_drops_is_not_said_to_stand(speed_mps: float, contrast_grey: float) -> None:
     """At 28 m/s each image of the road is another one: a second changes it no more than a tenth does."""
     stillness, proven = watched(speed_mps, 10.0, contrast_grey, 500)
-    assert stillness.contradicted
+    assert stillness.is_contradicted
     assert not any(proven)
 
 
 def test_a_slow_change_says_that_the_car_moves() -> None:
     stillness, proven = watched(0.12, 30.0, 20.0, 500)
-    assert stillness.contradicted
+    assert stillness.is_contradicted
     assert not any(proven)
 
 
 def test_a_road_that_shows_nothing_tells_nothing() -> None:
     stillness, proven = watched(0.0, 10.0, 0.0, 0)
-    assert not stillness.contradicted
+    assert not stillness.is_contradicted
     assert not any(proven)
 
 
@@ -105,7 +105,7 @@ def test_vehicles_are_no_road_and_a_view_full_of_them_tells_nothing() -> None:
             image = road_image(0.0, 20.0)
             image[60:, 205:380] = rng.uniform(0.0, 255.0)  # it drives
             stillness.update(shown(image, rng), k * 100_000_000, boxes_px)
-        assert stillness.proven == tells
+        assert stillness.is_proven == tells
 
 
 def _drive(speed_mps: float, contrast_grey: float, seconds: float, rate_hz: float = 20.0) -> list[Motion]:
@@ -152,10 +152,10 @@ def test_a_stop_on_faint_road_is_seen_through_noise() -> None:
     changes = stillness.changes
     assert changes is not None
     assert changes[0] > StillnessConfig().contrast_share * changes[2]
-    assert stillness.proven
+    assert stillness.is_proven
 
 
 @pytest.mark.parametrize("speed_mps", [0.3, 3.0, 20.0])
 def test_noise_makes_no_stop(speed_mps: float) -> None:
-    assert not _noisy(speed_mps, 5.0, 1.1).proven
-    assert not _noisy(speed_mps, 5.0, 1.0, grain=True).proven
+    assert not _noisy(speed_mps, 5.0, 1.1).is_proven
+    assert not _noisy(speed_mps, 5.0, 1.0, grain=True).is_proven

@@ -37,8 +37,8 @@ from birdslam.odometry.road.points import is_night, on_road, outside
 from birdslam.odometry.road.scale import RoadScale
 from birdslam.odometry.road.vanishing_point import VanishingPoint
 from birdslam.odometry.speed.constant_velocity import ConstantVelocityPrior
-from birdslam.odometry.speed.scale import MOVING_M, CarMotion
-from birdslam.odometry.speed.standing import StandingDetector
+from birdslam.odometry.speed.scale import MIN_MOVING_M, CarMotion
+from birdslam.odometry.speed.standstill import StandstillDetector
 from birdslam.odometry.speed.zero_velocity import near_road_flow_px
 from birdslam.odometry.working_resolution import WorkingResolution
 from birdslam.types import SpeedReading, Status
@@ -92,7 +92,7 @@ class Odometry:
         )
         self._velocity_prior = ConstantVelocityPrior(cfg.constant_velocity, cfg.start.camera_ahead_m)
         self._selector = CornerSelector(self.camera, cfg.fixed_corners, cfg.below_plane)
-        self._standstill = StandingDetector(self.camera, cfg.zero_velocity, cfg.stillness, cfg.min_fitting)
+        self._standstill = StandstillDetector(self.camera, cfg.zero_velocity, cfg.stillness, cfg.min_fitting)
         self._has_excluded_corners = False  # fixed corners were excluded from the newest motion
         self._fixed_count = 0  # count of fixed corners in the newest image
         self._initial_step: Pose | None = None  # the step to the current image by the initialiser
@@ -204,7 +204,7 @@ class Odometry:
         if (stationary or self._seems_still(corners)) and self._standstill.needs_proof(
             stationary, self._scale.is_unknown, self._selector.obstructed, speed_mps, dt_s, car
         ):
-            if not self._standstill.near_road.proven:
+            if not self._standstill.near_road.is_proven:
                 return self._coast_unproven(tracks, frame_id, t_source_ns, boxes_px, dt_s, car)
             stationary, pose_estimate = True, (self._pose, _TWO_VIEW_INFORMATION)
         is_slipping = False
@@ -226,7 +226,7 @@ class Odometry:
         else:
             was_uncertain = self._velocity_prior.sigma_rel > cfg.road.invalid_sigma_rel
             pose, info, predicted_sigma_m = self._apply_velocity_prior(pose, info, dt_s)
-            if was_uncertain and not self._velocity_prior.active:
+            if was_uncertain and not self._velocity_prior.is_active:
                 # The window's landmarks were triangulated at an uncertain predicted speed
                 pose, info = self._restart_by_two_views(corners, dt_s, car) or (pose, info)
             # Errors of predicted steps are correlated, which the scale's sigma states; their ratios are more certain
@@ -312,7 +312,7 @@ class Odometry:
             length = 0.5
         if self._initial_step is not None:
             length = float(np.linalg.norm(self._initial_step.p))
-        if car is not None and abs(car.forward_m) > MOVING_M:
+        if car is not None and abs(car.forward_m) > MIN_MOVING_M:
             length = abs(car.forward_m)
         frame = self._reference_frame if self._reference_frame is not None else 0
         self._window = KeyframeWindow(self._focal_px, cfg)
@@ -370,15 +370,15 @@ class Odometry:
     # --- moving, stationary, coasting ---
 
     def _seems_still(self, corners: Corners) -> bool:
-        return self._standstill.seems_still(corners.displacement_px, self._fixed_count)
+        return self._standstill.has_still_corners(corners.displacement_px, self._fixed_count)
 
     def _coast_unproven(
         self, tracks: Tracks, frame_id: int, t_source_ns: int, boxes_px: Floats, dt_s: float, car: CarMotion | None
     ) -> Motion:
         """Coasts, since the unmoved corners may be on the windscreen. Restarts the window after too long."""
-        obstructed = self._selector.obstructed or self._standstill.near_road.contradicted
+        obstructed = self._selector.obstructed or self._standstill.near_road.is_contradicted
         motion = self._coast(frame_id, dt_s, [Status.VIEW_OBSTRUCTED] * obstructed, car)
-        if self._standstill.held_too_long(dt_s):
+        if self._standstill.is_prior_expired(dt_s):
             self._start_window(tracks, frame_id, t_source_ns, boxes_px)
             self._scale.reset_tilt()
         return motion
@@ -386,7 +386,7 @@ class Odometry:
     def _is_moving(self, car: CarMotion | None) -> bool:
         """Whether the car is certain to move, by its own speed or by its last motion at a known scale."""
         if car is not None:
-            return car.proven and car.is_moving(MOVING_M)
+            return car.is_proven and car.is_moving(MIN_MOVING_M)
         return not self._scale.is_unknown and self._model.speed_mps > _MIN_MOVING_MPS
 
     def _apply_velocity_prior(self, pose: Pose, info: Floats, dt_s: float) -> tuple[Pose, Floats, float]:
@@ -400,13 +400,13 @@ class Odometry:
 
     def _update_motion(self, frame_id: int, step: Pose, cov6: Floats, dt_s: float, displacement_px: Floats) -> Motion:
         length_m = float(np.linalg.norm(step.p))
-        over_s, earlier_m = self._standstill.moved(displacement_px, length_m, dt_s)
+        over_s, earlier_m = self._standstill.add_motion(displacement_px, length_m, dt_s)
         self._model.update(step, dt_s, over_s)
         self._velocity_prior.update(planar(step, self._scale.ground), over_s)
         return self._records.measured(self._frames(frame_id), step, cov6, self._has_excluded_corners, dt_s, earlier_m)
 
     def _update_zero_velocity(self, frame_id: int, dt_s: float) -> Motion:
-        unseen_m = self._standstill.stood(dt_s)
+        unseen_m = self._standstill.add_unmoved(dt_s)
         if not unseen_m:
             self._model.stop()
             self._velocity_prior.stop()

@@ -235,7 +235,7 @@ class RoadScale:
     def sources(self) -> tuple[SpeedSource, ...]:
         """Sources of the metric scale."""
         road = (SpeedSource.ROAD,) if self._sees_road() else ()
-        car = (SpeedSource.CAR,) if self._car.measures else ()
+        car = (SpeedSource.CAR,) if self._car.is_measuring else ()
         return road + car or (SpeedSource.CARRIED,)
 
     def car_status(self) -> list[Status]:
@@ -249,7 +249,7 @@ class RoadScale:
     def status(self) -> list[Status]:
         """Faults of the scale, the ground plane and the mount."""
         out: list[Status] = []
-        if not self._sees_road() and not self._car.measures:
+        if not self._sees_road() and not self._car.is_measuring:
             out.append(Status.SCALE_CARRIED)
         if self.is_unknown or self._confirmation.is_outweighed:
             out.append(Status.SCALE_INVALID)
@@ -307,7 +307,7 @@ class RoadScale:
         if found is None:
             return 1.0
         fit, searched, prior_cov = found
-        known = confirmation.is_known or self._car.measures
+        known = confirmation.is_known or self._car.is_measuring
         min_correlation = cfg.min_correlation
         is_distinct = fit.length_information > cfg.doubt_sigma_rel**-2  # other lengths are far less likely
         log_length = float(np.log(searched)) + float(fit.state[0])
@@ -335,10 +335,10 @@ class RoadScale:
             self._is_scale_predicted = False
         factor = searched * filter_.update_alignment(fit, min(1.0, filter_.unaligned_m / length))
         if abs(np.log(factor)) > cfg.doubt_sigma_rel:
-            self._car.road_contradicts(float(np.log(factor)))
+            self._car.add_contradiction(float(np.log(factor)))
         confirmation.confirm(information, float(np.log(factor)))
         self._has_been_known = self._has_been_known or confirmation.is_known
-        if not confirmation.is_known and not self._car.measures:
+        if not confirmation.is_known and not self._car.is_measuring:
             filter_.cov[0, 0] = max(filter_.cov[0, 0], (1.1 * cfg.doubt_sigma_rel) ** 2)
         return factor
 

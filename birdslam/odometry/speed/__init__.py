@@ -1,1 +1,1 @@
-"""The car's own speed, the metric scale by it, and what holds where images show no motion: zero velocity, a prior."""
+"""The car's own speed and the metric scale from it; zero-velocity detection and a velocity prior."""

@@ -1,9 +1,8 @@
-"""Positive evidence that the car stands: the near road's image has not changed, and would have.
+"""Standstill detection from the image of the near road.
 
-Corners that have not moved do not say so: drops on the windscreen do not move while the car drives either. The image
-of the near road does change then, behind drops and an encoder too, though faintly, and the more the longer one waits;
-that of a car that stands differs by noise, which is the same after any time. So the change over a second is compared
-with that over a tenth of it (noise), and with the image's own contrast, without which nothing could be seen to move.
+Unmoved corners are no proof, since drops on the windscreen do not move either. While the car moves, the image of the
+near road changes with time, even behind drops; at a standstill it changes only by noise, independent of time. So the
+change over a second is compared with that over a tenth of it, and with the contrast of the image.
 """
 
 from __future__ import annotations
@@ -28,36 +27,35 @@ Grey = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 
-_NEAR_M = 20.0  # road nearer than this moves in the image with the car
-_CELLS_PER_RAD = 180.0  # 0.3 degrees a cell: noise of single pixels averages out
-_CONTRAST_RAD = 0.05  # over which a cell's brightness is compared with its surroundings'
-_MIN_CELLS = 200  # of the near road outside vehicles, for a comparison: 4 by 4 degrees
-_QUANTILE = 0.75  # of the changes: drops and the bonnet, which never change, may hide most of the road
-_NORMAL_QUANTILE = 1.15  # of a normal distribution's absolute values, in sigmas
-_NOISE_KERNEL = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)  # no gradient or edge passes it
-_ROUNDING_GREY = 0.29  # 1-sigma of a grey level's rounding: an encoder that repeats blocks shows no other noise
-_TIME_TOLERANCE = 0.9  # of a lag, for images that come a little early
+_NEAR_M = 20.0  # maximum distance of the near road
+_CELLS_PER_RAD = 180.0  # 0.3 degrees per cell, to average the noise of pixels
+_CONTRAST_RAD = 0.05  # window of the contrast
+_MIN_CELLS = 200  # of the near road outside vehicles: 4 by 4 degrees
+_QUANTILE = 0.75  # of the changes: drops and the bonnet may hide most of the road
+_NORMAL_QUANTILE = 1.15  # _QUANTILE of the absolute values of a normal distribution, in sigmas
+_NOISE_KERNEL = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)  # suppresses gradients and edges
+_ROUNDING_GREY = 0.29  # 1-sigma of the rounding of grey levels
+_TIME_TOLERANCE = 0.9  # minimum ratio of a time lag to its nominal value
 
 
 class StillnessConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """When the near road counts as unchanged. By judgement, seen on two films: behind drops on a motorway the change
-    over a second is 3.2 to 12 times that over a tenth and 0.2 to 0.5 of the contrast; at a stop 1.1 times and 0.08."""
+    """Parameters of the detection of an unchanged near road."""
 
-    long_s: Positive = 1.0  # over which the image must not change
-    short_s: Positive = 0.1  # over which it changes by noise
-    growth: Positive = 2.5  # the former over the latter: above it the car moves
-    contrast_share: Positive = 0.15  # change over contrast, above which there is no evidence
+    long_s: Positive = 1.0  # the long lag, over which the image must not change
+    short_s: Positive = 0.1  # the short lag, over which it changes by noise
+    growth: Positive = 2.5  # change over the long lag to that over the short one, above which the car moves
+    contrast_share: Positive = 0.15  # change over contrast, above which there is no proof of a standstill
 
 
 @dataclass(frozen=True)
 class _Sample:
     t_ns: int
     cells: Grey  # (rows, columns) mean brightness
-    shown: Bools  # (rows, columns) outside vehicles
+    shown: Bools  # (rows, columns) visible road outside vehicles
 
 
 class NearRoadStillness:
-    """State: the near road's image over the last second. Reader: `Odometry`, before a zero-velocity update."""
+    """State: images of the near road over the long lag. Reader: `Odometry`, before a zero-velocity update."""
 
     def __init__(self, camera: Camera, config: StillnessConfig) -> None:
         self.config = config
@@ -69,14 +67,14 @@ class NearRoadStillness:
         height_px = camera.height_px - self._top_px
         self._size = (round(camera.width_px / self._cell_px), round(height_px / self._cell_px))
         self._samples: deque[_Sample] = deque()
-        self._newest: NDArray[np.uint8] = np.zeros((0, 0), np.uint8)  # the near road's part of the newest image
+        self._newest: NDArray[np.uint8] = np.zeros((0, 0), np.uint8)  # its part with the near road
 
     def reset(self) -> None:
-        """The images before can't be compared with those to come."""
+        """Drops the past images, for example after a change of the exposure."""
         self._samples.clear()
 
     def update(self, grey: NDArray[np.uint8], t_ns: int, boxes_px: Floats) -> None:
-        """Takes (H, W) grey; `boxes_px` (N, 4) are vehicles."""
+        """Adds an image (H, W); `boxes_px` (N, 4) are vehicles."""
         samples, cfg = self._samples, self.config
         if samples and t_ns <= samples[-1].t_ns:
             samples.clear()
@@ -89,7 +87,7 @@ class NearRoadStillness:
         for x1, y1, x2, y2 in (boxes_px - np.tile([0.0, self._top_px], 2)) / self._cell_px:
             shown[max(int(y1) - 1, 0) : max(int(y2) + 2, 0), max(int(x1) - 1, 0) : max(int(x2) + 2, 0)] = False
         newest_replaced = len(samples) > 1 and t_ns - samples[-2].t_ns < _TIME_TOLERANCE * cfg.short_s * NS_PER_S
-        if newest_replaced:  # samples are kept at the short lag, and the newest image beside them
+        if newest_replaced:  # keep samples at the short lag, and the newest image
             samples.pop()
         samples.append(_Sample(t_ns, cells, shown))
         while len(samples) > 2 and t_ns - samples[1].t_ns >= _TIME_TOLERANCE * cfg.long_s * NS_PER_S:
@@ -97,9 +95,9 @@ class NearRoadStillness:
 
     @property
     def changes(self) -> tuple[float, float, float] | None:
-        """Change of the near road's image over the long lag and over the short one, and its contrast, grey levels.
+        """Change over the long lag and over the short one, and contrast, in grey levels.
 
-        None: the lag is too short yet, or too little is seen.
+        None if the lag is too short or too little road is visible.
         """
         samples, cfg = self._samples, self.config
         if len(samples) < 3 or samples[-1].t_ns - samples[0].t_ns < _TIME_TOLERANCE * cfg.long_s * NS_PER_S:
@@ -117,39 +115,39 @@ class NearRoadStillness:
         return long, quantile(np.array(short), 0.5), quantile(contrast.astype(np.float64), _QUANTILE)
 
     @property
-    def contradicted(self) -> bool:
-        """Whether the near road is seen to have changed by more than noise, slowly or from one image to the next."""
+    def is_contradicted(self) -> bool:
+        """Whether the near road changed by more than noise, slowly or between two images."""
         changes, cfg = self.changes, self.config
         if changes is None:
             return False
         long, short, contrast = changes
-        another_image = long > cfg.contrast_share * contrast and long > cfg.growth * self._noise_of_cells()
-        return bool(another_image or long >= cfg.growth * max(short, _ROUNDING_GREY))
+        is_image_changed = long > cfg.contrast_share * contrast and long > cfg.growth * self._noise_of_cells()
+        return bool(is_image_changed or long >= cfg.growth * max(short, _ROUNDING_GREY))
 
     def _noise_of_cells(self) -> float:
-        """The change of cells' brightness by the newest image's own noise (Immerkaer 1996), grey levels.
+        """Change of the cells' brightness due to image noise (Immerkaer 1996), in grey levels.
 
-        Grain of the road counts as noise, so that it is rather too large.
+        It is overestimated, since the grain of the road counts as noise.
         """
         by_pixel = np.abs(cv2.filter2D(self._newest, cv2.CV_32F, _NOISE_KERNEL)).ravel().astype(np.float64)
         sigma_grey = 1.4826 / 6.0 * quantile(by_pixel, 0.5)
         return _NORMAL_QUANTILE * math.hypot(sigma_grey, _ROUNDING_GREY) * math.sqrt(2.0) / self._cell_px
 
     @property
-    def proven(self) -> bool:
-        """Whether the near road is seen to have stood for the long lag."""
+    def is_proven(self) -> bool:
+        """Whether the near road shows a standstill over the long lag."""
         changes, cfg = self.changes, self.config
         if changes is None:
             return False
         long, short, contrast = changes
-        most = cfg.contrast_share * contrast
-        # What noise alone changes counts for nothing, but no more of it than `most`: on a road of grain all is noise
-        noise = min(short, self._noise_of_cells(), most)
-        return long < cfg.growth * max(short, _ROUNDING_GREY) and long**2 - noise**2 < most**2
+        max_change = cfg.contrast_share * contrast
+        # Subtract the noise, at max_change `max_change`: on a grainy road, all is noise
+        noise = min(short, self._noise_of_cells(), max_change)
+        return long < cfg.growth * max(short, _ROUNDING_GREY) and long**2 - noise**2 < max_change**2
 
 
 def _change(then: _Sample, now: _Sample) -> float | None:
-    """Grey levels by which the image has changed, beside a change of all its brightness."""
+    """Change of the image in grey levels, without a change of the overall brightness; None if too little is visible."""
     shown = then.shown & now.shown
     if shown.sum() < _MIN_CELLS:
         return None
