@@ -13,7 +13,7 @@ from birdslam.perception.decoding.detection import with_bodies
 from birdslam.perception.shipped import run_at_once
 from birdslam.vehicles.placement.depth_fusion import PseudoLidarConfig
 from birdslam.vehicles.placement.localisation import LocalisationConfig, observe_boxes
-from birdslam.vehicles.placement.pseudolidar import bodies_by_detector
+from birdslam.vehicles.placement.pseudolidar import locate_detected_bodies
 from tests.heads import Head
 
 CAMERA = Camera(1242, 375, 720.0, 720.0, 620.0, 180.0, height_m=1.65)
@@ -56,7 +56,7 @@ def test_each_box_has_the_body_of_the_box_that_overlaps_it_most() -> None:
 def test_a_box_without_a_body_is_placed_by_its_edges_alone() -> None:
     found = with_bodies(boxes(LEFT, RIGHT), embodied(boxes(SHIFTED_RIGHT), [20.0]))
     seen = observe_boxes(found.boxes_px, found.scores, found.labels, CAMERA, CAMERA.ground, LocalisationConfig(), None)
-    measured, places = bodies_by_detector(seen, found, CAMERA, CAMERA.ground, PseudoLidarConfig())
+    measured, places = locate_detected_bodies(seen, found, CAMERA, CAMERA.ground, PseudoLidarConfig())
     by_row = {o.row: (o, m, p) for o, m, p in zip(seen, measured, places, strict=True)}
     before, after, place = by_row[0]
     assert place is None

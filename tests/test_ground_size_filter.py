@@ -18,7 +18,7 @@ from birdslam.vehicles.placement.localisation import (
 )
 from birdslam.vehicles.state.ground_measurements import COMMON
 from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
-from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter, bend_of
+from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter, estimate_curvature
 from birdslam.vehicles.state.parallax import LearnedSize
 
 CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
@@ -54,7 +54,7 @@ class Road:
             seen += observe_boxes(box[None], np.ones(1), ("car",), CAMERA, self.ground_size.ground, LOCALISATION)
             if car not in self.cars:
                 self.cars.append(car)
-                self.ground_size.begin(seen[-1])
+                self.ground_size.add_vehicle(seen[-1])
         extents = np.array([extent_m(CAR, 0.0, o.depth_by_height_m, o.bearing) for o in seen])
         depths = self.ground_size.estimate_depths(
             [self.cars.index(car) for car in boxes], seen, extents[:, 1], extents[:, 0], np.zeros(len(seen))
@@ -274,7 +274,7 @@ def test_a_box_that_widens_is_of_a_car_that_turns_or_of_one_that_comes_nearer(sp
         road.ground_size.predict(0.1, 0.0, None, None)
         seen = observe_boxes(box[None], np.ones(1), ("car",), CAMERA, road.ground_size.ground, LOCALISATION)
         if not len(road.ground_size):
-            road.ground_size.begin(seen[0])
+            road.ground_size.add_vehicle(seen[0])
         extents = np.array([extent_m(CAR, 0.0, o.depth_by_height_m, o.bearing) for o in seen])
         depths = road.ground_size.estimate_depths([0], seen, extents[:, 1], extents[:, 0], np.zeros(1), motion)
     nearer_rel = 1.0 - float(np.exp(depths.log_depth[0])) / (30.0 - CAR.length_m / 2.0)
@@ -308,7 +308,7 @@ def test_boxes_do_not_correct_the_vertical_curvature_and_suffer_from_its_error()
         road, crest = Road(), VerticalCurvature(-0.002, own)
         for _ in range(10):
             _, sigmas = road.see({0: road.box(20.0, 0.0, 1.9), 1: road.box(40.0, 3.0, 1.2)}, vertical=crest)
-        mean, variance = bend_of(crest, CONFIG.sigma_vertical_per_m, CONFIG.vertical_dof)
+        mean, variance = estimate_curvature(crest, CONFIG.sigma_vertical_per_m, CONFIG.vertical_dof)
         assert road.ground_size.vertical_per_m == pytest.approx(mean)
         assert road.ground_size.sigma_vertical_per_m == pytest.approx(math.sqrt(variance))
         sigma[own] = sigmas[1]
@@ -316,11 +316,11 @@ def test_boxes_do_not_correct_the_vertical_curvature_and_suffer_from_its_error()
 
 
 def test_a_hill_is_believed_and_a_small_bend_is_not() -> None:
-    hill, hill_var = bend_of(VerticalCurvature(0.002, 2e-4), 1.5e-4, 6.0)
-    small, small_var = bend_of(VerticalCurvature(1.5e-4, 2e-4), 1.5e-4, 6.0)
+    hill, hill_var = estimate_curvature(VerticalCurvature(0.002, 2e-4), 1.5e-4, 6.0)
+    small, small_var = estimate_curvature(VerticalCurvature(1.5e-4, 2e-4), 1.5e-4, 6.0)
     assert hill > 0.0018
     assert small < 1e-4
     assert small_var < hill_var < 2e-4**2
-    none, none_var = bend_of(VerticalCurvature(0.0, 5e-4), 1.5e-4, 6.0)
+    none, none_var = estimate_curvature(VerticalCurvature(0.0, 5e-4), 1.5e-4, 6.0)
     assert none == 0.0
     assert math.sqrt(none_var) < 1.5e-4

@@ -55,7 +55,7 @@ def test_errors_that_last_for_a_track_are_in_its_sigma_after_many_frames() -> No
             boxes += rng.normal(0.0, 0.6, boxes.shape)
             frame = EgoFrame(k, round(k * DT_S * 1e9), SE2(STEP_M * k, 0.0, 0.0), np.diag([1e-4, 1e-4, 1e-8]))
             seen = observe_boxes(boxes, np.ones(3), ("car",) * 3, CAMERA, ground_size.ground, LOCALISATION)
-            for track in tracker.follow(frame, seen):
+            for track in tracker.update(frame, seen):
                 truth = np.array(min(cars, key=lambda car, t=track: abs(car[1] - float(t.place.centre_m[1]))))
                 truth = truth - [STEP_M * k, 0.0]
                 error = track.place.centre_m - truth
@@ -83,7 +83,7 @@ def test_the_lower_edge_of_a_vehicle_is_never_learned_from_itself() -> None:
             LOCALISATION,
         )
         if not k:
-            ground_size.begin(seen)
+            ground_size.add_vehicle(seen)
         depths = ground_size.estimate_depths(
             [0], [seen], np.array([CAR.width_m]), np.array([CAR.length_m]), np.zeros(1)
         )
@@ -106,8 +106,8 @@ def test_a_parked_car_whose_box_becomes_its_neighbours_still_stands(leap_m: tupl
         x_m = 44.0 - 0.8 * k + leapt_m
         box = box_of(x_m, 3.8, CAMERA.ground, CAR.height_m)[None]
         frame = EgoFrame(k, round(k * DT_S * 1e9), SE2(0.8 * k, 0.0, 0.0), np.diag([1e-4, 1e-4, 1e-8]))
-        tracker.follow(frame, observe_boxes(box, np.ones(1), ("car",), CAMERA, ground_size.ground, LOCALISATION))
-        standing.append(tracker.placing.parallax.standing(0))
+        tracker.update(frame, observe_boxes(box, np.ones(1), ("car",), CAMERA, ground_size.ground, LOCALISATION))
+        standing.append(tracker.placing.parallax.stationary_probability(0))
     assert len(tracker.tracks) == 1  # it is one track: the box leapt within the gate
     assert min(standing[10:]) > 0.3
     assert standing[-1] > 0.8
@@ -120,5 +120,5 @@ def test_a_car_that_drives_off_is_not_taken_for_ever_new_neighbours() -> None:
         ground_size.predict(DT_S, 0.0, None, None, 0.8)
         box = box_of(20.0 + 0.4 * k, 3.8, CAMERA.ground, CAR.height_m)[None]
         frame = EgoFrame(k, round(k * DT_S * 1e9), SE2(0.8 * k, 0.0, 0.0), np.diag([1e-4, 1e-4, 1e-8]))
-        tracker.follow(frame, observe_boxes(box, np.ones(1), ("car",), CAMERA, ground_size.ground, LOCALISATION))
-    assert tracker.placing.parallax.standing(0) < 0.1
+        tracker.update(frame, observe_boxes(box, np.ones(1), ("car",), CAMERA, ground_size.ground, LOCALISATION))
+    assert tracker.placing.parallax.stationary_probability(0) < 0.1

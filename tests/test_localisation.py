@@ -57,7 +57,7 @@ def test_the_centre_follows_from_the_nearest_face_and_the_yaw(x_m: float, slope:
     near_m = GROUND.height_m / seen.slope_bottom  # Eq. 1
     along_m, outline_m = extent_m(CAR, yaw_rad, near_m, seen.bearing)
     assert near_m == pytest.approx(x_m - along_m / 2.0, rel=1e-3)
-    if not seen.cut_side:
+    if not seen.is_cut_at_side:
         assert outline_m / near_m == pytest.approx(seen.tan_width, rel=0.1)
     found = locate(box, near_m, yaw_rad)
     assert found.centre_m == pytest.approx([x_m, slope * x_m], abs=0.06)
@@ -79,7 +79,7 @@ def test_a_box_cut_at_the_side_is_placed_by_its_other_edge() -> None:
     assert whole[0] < 0.0 < whole[2]
     cut = np.maximum(whole, 0.0)
     (seen,) = observe([cut])
-    assert seen.cut_side
+    assert seen.is_cut_at_side
     found = locate(cut, 10.0 - CAR.length_m / 2.0)
     assert found.centre_m[1] == pytest.approx(7.0, abs=0.05)
     reach_m = CAR.length_m / 2.0
@@ -91,10 +91,10 @@ def test_a_box_cut_at_the_side_is_placed_by_its_other_edge() -> None:
 def test_of_a_box_cut_below_too_the_way_to_the_centre_is_least_known() -> None:
     cut = np.clip(box_of_car(5.0, 3.5), 0.0, [CAMERA.width_px, CAMERA.height_px] * 2)
     (seen,) = observe([cut])
-    assert seen.cut_side
+    assert seen.is_cut_at_side
     assert seen.sigma_cut is not None
     (beside,) = observe([np.maximum(box_of_car(10.0, 7.0), 0.0)])
-    assert beside.cut_side
+    assert beside.is_cut_at_side
     assert beside.sigma_cut is None
     assert CONFIG.sigma_reach_cut_rel > CONFIG.sigma_reach_side_rel > CAR.sigma_length_rel
     of_reach = [math.sqrt(place(o, math.log(5.0), 0.0, 0.0, CONFIG).cov[0, 0]) for o in (seen, beside)]
@@ -106,7 +106,7 @@ def test_a_centre_by_one_edge_moves_along_that_edges_line_of_sight() -> None:
     x_m, y_m = 5.6, 4.4  # an oncoming car: the edge that is seen is of its far end
     cut = np.clip(box_of_car(x_m, y_m), 0.0, [CAMERA.width_px, CAMERA.height_px] * 2)
     (seen,) = observe([cut])
-    assert seen.cut_side
+    assert seen.is_cut_at_side
     found = locate(cut, x_m - CAR.length_m / 2.0)
     of_edge = (y_m - CAR.width_m / 2.0) / (x_m + CAR.length_m / 2.0)
     assert found.cov[0, 1] / found.cov[0, 0] == pytest.approx(of_edge, rel=0.05)
@@ -124,7 +124,7 @@ def test_a_centre_moves_with_its_face_and_is_as_certain(near_m: float) -> None:
     reach_m, sigma = CAR.length_m / 2.0, 0.03
     box = box_of_car(near_m + reach_m, 0.0)
     (seen,) = observe([box])
-    seen = msgspec.structs.replace(seen, cut_side=False)
+    seen = msgspec.structs.replace(seen, is_cut_at_side=False)
     here, there = (place(seen, math.log(near_m) + d, sigma**2, 0.0, CONFIG) for d in (-1e-4, 1e-4))
     moved = (there.centre_m[0] - here.centre_m[0]) / 2e-4  # by the log of the face's depth
     of_length = (CAR.sigma_length_rel * reach_m) ** 2

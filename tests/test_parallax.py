@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from birdslam.geometry.se2 import SE2
-from birdslam.vehicles.state.parallax import UNKNOWN, LearnedSize, Parallax
+from birdslam.vehicles.state.parallax import UNKNOWN_VARIANCE, LearnedSize, Parallax
 from birdslam.vehicles.state.parallax_config import ParallaxConfig
 from birdslam.vehicles.state.parallax_measurements import ParallaxMeasurements
 
@@ -65,7 +65,7 @@ class Road:
             if not self.begun:
                 depth = CLASS_M / math.exp(float(seen.log_height[0])) + REACH_M
                 centre = np.array([depth, depth * float(seen.bearing[0])])
-                self.parallax.begin(centre, 0.0, T_world_ego, math.log(CLASS_M), SIGMAS)
+                self.parallax.add_vehicle(centre, 0.0, T_world_ego, math.log(CLASS_M), SIGMAS)
                 self.begun = True
             learned = self.parallax.learn_sizes([0], seen, T_world_ego, HEIGHT_M)
             self.at = self.at + np.array(mps) * self.dt_s
@@ -83,14 +83,14 @@ class Road:
 def test_a_parked_car_tells_its_size_as_the_ego_comes_near(height_m: float) -> None:
     road = Road(height_m)
     learned = road.drive(5.5)
-    assert road.parallax.standing(0) > 0.95
+    assert road.parallax.stationary_probability(0) > 0.95
     assert road.height(learned) == pytest.approx(height_m, rel=0.03)
 
 
 def test_what_stands_and_is_of_no_usual_size_is_seen_through() -> None:
     road = Road(2.45)
     learned = road.drive(5.5)
-    assert road.parallax.standing(0) > 0.9
+    assert road.parallax.stationary_probability(0) > 0.9
     best = int(learned.weight.argmax())
     assert learned.log_height[0, best] == pytest.approx(math.log(2.45), abs=0.25)
     assert road.height(learned) > 2.2
@@ -100,10 +100,10 @@ def test_what_stands_and_is_of_no_usual_size_is_seen_through() -> None:
 def test_one_that_drives_does_not_stand_and_keeps_the_size_of_its_class(mps: tuple[float, float]) -> None:
     road = Road(1.53, x_m=60.0)
     learned = road.drive(2.5, mps)
-    assert road.parallax.standing(0) < 0.1
+    assert road.parallax.stationary_probability(0) < 0.1
     assert road.height(learned) == pytest.approx(1.53, rel=0.03)
     moving = learned.variance[0, 2:]
-    assert (moving >= UNKNOWN).all()
+    assert (moving >= UNKNOWN_VARIANCE).all()
 
 
 @pytest.mark.parametrize("mps", [(0.0, 0.0), (1.8, 0.0)])
@@ -111,7 +111,7 @@ def test_straight_ahead_nothing_tells_a_parked_car_from_a_slow_one_so_that_no_si
     mps: tuple[float, float],
 ) -> None:
     learned = Road(1.70, x_m=16.0, y_m=0.3, ego_mps=2.3).drive(4.0, mps)
-    assert (learned.variance >= UNKNOWN).all()
+    assert (learned.variance >= UNKNOWN_VARIANCE).all()
     beside = Road(1.70, x_m=16.0, y_m=4.0, ego_mps=2.3).drive(4.0)
     assert beside.variance[0, 0] < SIGMAS[0]
 
@@ -125,8 +125,8 @@ def test_a_queue_in_the_next_lane_is_not_taken_for_tall_cars_that_stand(
     road = Road(height_m, x_m=45.0, ego_mps=8.0)
     road.parallax = Parallax(ParallaxConfig())  # errors last, so that few frames count
     road.drive(4.0 if mps >= 0.0 else 1.5, (mps, 0.0), noisy=False)
-    assert (road.parallax.standing(0) > 0.9) == stands
-    assert (road.parallax.standing(0) < 0.3) == (not stands)
+    assert (road.parallax.stationary_probability(0) > 0.9) == stands
+    assert (road.parallax.stationary_probability(0) < 0.3) == (not stands)
 
 
 def test_far_aside_of_the_road_whatever_keeps_its_bearing_in_the_world_stands() -> None:
@@ -135,17 +135,17 @@ def test_far_aside_of_the_road_whatever_keeps_its_bearing_in_the_world_stands() 
     aside.drive(1.5)
     beside = Road(1.53, x_m=60.0, y_m=4.0)
     beside.drive(1.5)
-    assert aside.parallax.standing(0) > beside.parallax.standing(0)
+    assert aside.parallax.stationary_probability(0) > beside.parallax.stationary_probability(0)
 
 
 def test_one_that_starts_and_one_that_stops() -> None:
     road = Road(1.53, x_m=60.0, ego_mps=4.0)
     road.drive(4.0)
-    assert road.parallax.standing(0) > 0.9
+    assert road.parallax.stationary_probability(0) > 0.9
     road.drive(3.0, (5.0, 0.0))
-    assert road.parallax.standing(0) < 0.1
+    assert road.parallax.stationary_probability(0) < 0.1
     road.drive(6.0)
-    assert road.parallax.standing(0) > 0.5
+    assert road.parallax.stationary_probability(0) > 0.5
 
 
 def test_its_covariance_is_honest() -> None:
@@ -176,10 +176,10 @@ def test_without_motion_nothing_is_learned() -> None:
 def test_the_forgotten_are_gone_and_the_rest_stay() -> None:
     road = Road(1.53)
     road.drive(1.0)
-    before = road.parallax.standing(0)
-    road.parallax.begin(np.array([20.0, 0.0]), 0.0, SE2(), math.log(CLASS_M), SIGMAS)
+    before = road.parallax.stationary_probability(0)
+    road.parallax.add_vehicle(np.array([20.0, 0.0]), 0.0, SE2(), math.log(CLASS_M), SIGMAS)
     road.parallax.keep_rows([0])
-    assert road.parallax.standing(0) == before
+    assert road.parallax.stationary_probability(0) == before
     assert len(road.parallax) == 1
     road.parallax.keep_rows([])
     road.parallax.predict(0.1, SE2(), np.eye(3))
@@ -191,7 +191,7 @@ def test_the_forgotten_are_gone_and_the_rest_stay() -> None:
 @settings(max_examples=25)
 def test_outliers_leave_weights_and_covariances_what_they_are(noise: list[tuple[float, float, float]]) -> None:
     parallax = Parallax(ParallaxConfig())
-    parallax.begin(np.array([30.0, 2.0]), 0.0, SE2(), math.log(CLASS_M), SIGMAS)
+    parallax.add_vehicle(np.array([30.0, 2.0]), 0.0, SE2(), math.log(CLASS_M), SIGMAS)
     for k, draws in enumerate(noise):
         ego = SE2(0.5 * k, 0.0, 0.0)
         parallax.predict(0.1, ego, np.diag([1e-3, 1e-4, 1e-7]))

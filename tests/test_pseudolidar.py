@@ -18,7 +18,7 @@ from birdslam.perception import Boxes3d, DepthMap, Detections
 from birdslam.vehicles.placement.body_fit import fit_footprint, footprints, surface_m
 from birdslam.vehicles.placement.depth_fusion import DepthPlace, PseudoLidarConfig, fuse
 from birdslam.vehicles.placement.localisation import LocalisationConfig, Observation, Place, observe_boxes, place
-from birdslam.vehicles.placement.pseudolidar import bodies_by_detector, in_metres, localise_by_depth
+from birdslam.vehicles.placement.pseudolidar import in_metres, locate_detected_bodies, locate_in_depth_map
 
 CAMERA = Camera(
     width_px=1242, height_px=375, fx_px=720.0, fy_px=720.0, cx_px=610.0, cy_px=173.0, height_m=1.65, pitch_rad=0.01
@@ -117,8 +117,8 @@ def test_no_place_where_the_depth_says_nothing() -> None:
     assert fit_footprint(seen, tiny, CAMERA, CAMERA.ground, CONFIG) is None
     far = DepthMap(np.full((96, 320), 90.0, np.float32), 1242, 375)
     assert fit_footprint(seen, far, CAMERA, CAMERA.ground, CONFIG) is None
-    assert localise_by_depth([seen], depth, CAMERA, CAMERA.ground, PseudoLidarConfig(rule="off")) == [None]
-    assert localise_by_depth([], depth, CAMERA, CAMERA.ground, CONFIG) == []
+    assert locate_in_depth_map([seen], depth, CAMERA, CAMERA.ground, PseudoLidarConfig(rule="off")) == [None]
+    assert locate_in_depth_map([], depth, CAMERA, CAMERA.ground, CONFIG) == []
 
 
 def test_a_map_without_a_scale_gets_it_from_the_road() -> None:
@@ -132,9 +132,9 @@ def test_a_map_without_a_scale_gets_it_from_the_road() -> None:
     np.testing.assert_allclose(np.median(metres.depth_m / depth.depth_m), 1.0, atol=0.01)
     for nothing in (None, np.zeros((375, 1242), bool)):
         assert in_metres(unscaled, CAMERA, CAMERA.ground, nothing, CONFIG) is None
-        assert localise_by_depth(observed(boxes), unscaled, CAMERA, CAMERA.ground, CONFIG, nothing) == [None]
-    exact = localise_by_depth(observed(boxes), depth, CAMERA, CAMERA.ground, CONFIG)[0]
-    scaled = localise_by_depth(observed(boxes), unscaled, CAMERA, CAMERA.ground, CONFIG, road)[0]
+        assert locate_in_depth_map(observed(boxes), unscaled, CAMERA, CAMERA.ground, CONFIG, nothing) == [None]
+    exact = locate_in_depth_map(observed(boxes), depth, CAMERA, CAMERA.ground, CONFIG)[0]
+    scaled = locate_in_depth_map(observed(boxes), unscaled, CAMERA, CAMERA.ground, CONFIG, road)[0]
     assert exact is not None
     assert scaled is not None
     np.testing.assert_allclose(scaled.centre_m, exact.centre_m, rtol=0.02)
@@ -174,7 +174,7 @@ def test_the_network_is_asked_for_boxes_with_points_and_its_answers_are_places_i
     depth, boxes = scene(poses)
     network = Told(told(poses))
     config = PseudoLidarConfig(least_points=100)
-    near, far = localise_by_depth(observed(boxes), depth, CAMERA, CAMERA.ground, config, network=network)
+    near, far = locate_in_depth_map(observed(boxes), depth, CAMERA, CAMERA.ground, config, network=network)
     assert len(network.asked) == 1  # the far one has too few points
     assert far is None
     assert near is not None
@@ -184,7 +184,7 @@ def test_the_network_is_asked_for_boxes_with_points_and_its_answers_are_places_i
     depth_m = network.bodies.depth_m[0] if network.bodies is not None else math.nan
     assert near.cov[0, 0] == pytest.approx(0.5**2 + (0.05 * depth_m) ** 2)  # what it says, and what the map is worth
     # One that gives no numbers leaves the fit
-    fallback = localise_by_depth(observed(boxes), depth, CAMERA, CAMERA.ground, config, network=Told(None))
+    fallback = locate_in_depth_map(observed(boxes), depth, CAMERA, CAMERA.ground, config, network=Told(None))
     assert fallback[0] is not None
     assert fallback[0].size_m is None
 
@@ -198,18 +198,18 @@ def test_bodies_that_the_detector_knows_of_are_the_second_source() -> None:
     poses = [SE2(10.0, 2.0, 0.4), SE2(25.0, -3.0, 2.0)]
     detections = found_with(poses, told(poses))
     seen = observed(detections.boxes_px)[::-1]  # as bodies go with their boxes, the order is of no matter
-    measured, (far, near) = bodies_by_detector(seen, detections, CAMERA, CAMERA.ground, CONFIG)
+    measured, (far, near) = locate_detected_bodies(seen, detections, CAMERA, CAMERA.ground, CONFIG)
     assert near is not None
     assert far is not None
     np.testing.assert_allclose(near.centre_m, [10.0, 2.0], atol=1e-6)
     np.testing.assert_allclose(far.centre_m, [25.0, -3.0], atol=1e-6)
     assert near.cov[0, 0] == pytest.approx(0.5**2)
-    assert near.front_seen
+    assert near.has_front
     assert [o.box_px for o in measured] == [o.box_px for o in seen]
     off = PseudoLidarConfig(rule="off")
-    assert bodies_by_detector(seen, detections, CAMERA, CAMERA.ground, off) == (seen, [None, None])
+    assert locate_detected_bodies(seen, detections, CAMERA, CAMERA.ground, off) == (seen, [None, None])
     without = Detections(detections.boxes_px, detections.scores, detections.labels)
-    assert bodies_by_detector(seen, without, CAMERA, CAMERA.ground, CONFIG) == (seen, [None, None])
+    assert locate_detected_bodies(seen, without, CAMERA, CAMERA.ground, CONFIG) == (seen, [None, None])
 
 
 def test_of_boxes_that_are_equal_each_keeps_its_own_body() -> None:
@@ -219,7 +219,7 @@ def test_of_boxes_that_are_equal_each_keeps_its_own_body() -> None:
     twice = replace(detections, boxes_px=boxes_px, scores=scores, labels=("car",) * 2)
     seen = observe_boxes(boxes_px, scores, twice.labels, CAMERA, CAMERA.ground, LOCALISATION)
     assert [o.row for o in seen] == [0]  # one vehicle, by the better score
-    _, (found,) = bodies_by_detector(seen, twice, CAMERA, CAMERA.ground, CONFIG)
+    _, (found,) = locate_detected_bodies(seen, twice, CAMERA, CAMERA.ground, CONFIG)
     assert found is not None
     np.testing.assert_allclose(found.centre_m, [10.0, 2.0], atol=1e-6)
 
@@ -231,7 +231,7 @@ def test_the_length_is_of_class_and_body_together_and_the_face_stays(
     poses = [SE2(x_m, 0.0, yaw_rad)]
     size = replace(told(poses), size_m=np.array([[length_m, CAR.width_m, CAR.height_m]]))
     detections = found_with(poses, replace(size, sigma_size_m=np.full((1, 3), sigma_m)))
-    (seen,), (found,) = bodies_by_detector(observed(detections.boxes_px), detections, CAMERA, CAMERA.ground, CONFIG)
+    (seen,), (found,) = locate_detected_bodies(observed(detections.boxes_px), detections, CAMERA, CAMERA.ground, CONFIG)
     together_m, of_class_m = seen.dimensions.length_m, CAR.sigma_length_rel * CAR.length_m
     assert min(length_m, CAR.length_m) - 1e-9 <= together_m <= max(length_m, CAR.length_m) + 1e-9
     assert seen.dimensions.sigma_length_rel * together_m == pytest.approx(1 / math.hypot(1 / sigma_m, 1 / of_class_m))

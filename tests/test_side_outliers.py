@@ -92,7 +92,7 @@ def seen_at(x_m: float, y_m: float, hidden: float = 0.0) -> ParallaxMeasurements
 def drive_past(config: ParallaxConfig, hidden: float) -> tuple[float, Floats]:
     """A parked car 6 m aside, half of whose box a tree hides for half a second: whether it stands, the outliers."""
     parallax = Parallax(config)
-    parallax.begin(np.array([40.0, 6.0]), 0.0, SE2(), math.log(CAR_HEIGHT_M), (0.08, 0.2))
+    parallax.add_vehicle(np.array([40.0, 6.0]), 0.0, SE2(), math.log(CAR_HEIGHT_M), (0.08, 0.2))
     outlier = np.zeros(2)
     for frame in range(20):
         ego = SE2(x_m=0.8 * frame)
@@ -100,7 +100,7 @@ def drive_past(config: ParallaxConfig, hidden: float) -> tuple[float, Floats]:
         behind = hidden if frame >= 15 else 0.0
         learned = parallax.learn_sizes([0], seen_at(40.0 - 0.8 * frame, 6.0, behind), ego, CAMERA_M)
         outlier = learned.side_outlier[0]
-    return parallax.standing(0), outlier
+    return parallax.stationary_probability(0), outlier
 
 
 def test_a_parked_car_that_a_tree_hides_in_part_still_stands() -> None:

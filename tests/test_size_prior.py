@@ -22,7 +22,7 @@ def born(dof: float = DOF) -> tuple[SizePrior, np.ndarray, np.ndarray]:
     prior, x, P = SizePrior(COMMON, dof), np.zeros(3), np.zeros((3, 3))
     P[0, 0] = COMMON**2
     for k in AT:
-        share, own = prior.begin(1.5, SIGMA)
+        share, own = prior.add_vehicle(1.5, SIGMA)
         x[k] = math.log(1.5)
         P[k] = P[:, k] = share * P[:, 0]
         P[k, k] = share * P[0, 0] + own

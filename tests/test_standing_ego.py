@@ -39,7 +39,7 @@ def see(
     n, ground = len(boxes), ground_size.ground
     seen = [observe_boxes(b[None], np.ones(1), ("car",), CAMERA, ground, LOCALISATION)[0] for b in boxes]
     for new in seen[len(ground_size) :]:
-        ground_size.begin(new)
+        ground_size.add_vehicle(new)
     extents = np.array([extent_m(CAR, 0.0, o.depth_by_height_m, o.bearing) for o in seen]).reshape(-1, 2)
     learned = LearnedSize(
         np.ones((n, 1)), np.zeros((n, 1)), np.full((n, 1), 1e6), np.full(n, speed_mps), np.zeros((n, 2))

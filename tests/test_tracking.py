@@ -9,7 +9,7 @@ import pytest
 from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2, wrap
-from birdslam.vehicles.association import predicted_boxes_px
+from birdslam.vehicles.association import predict_boxes_px
 from birdslam.vehicles.placement.depth_fusion import DepthPlace
 from birdslam.vehicles.placement.localisation import LocalisationConfig, iou, observe_boxes
 from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
@@ -51,7 +51,7 @@ class Drive:
         names = tuple((labels or ["car"] * len(vehicles))[i] for i in kept)
         seen = observe_boxes(px, np.full(len(px), 0.9), names, CAMERA, self.ground_size.ground, LocalisationConfig())
         self.ground_size.predict(0.1, 0.0, None, None)
-        out = self.tracker.follow(EgoFrame(self.frame, self.frame * PERIOD_NS, T_world_ego), seen)
+        out = self.tracker.update(EgoFrame(self.frame, self.frame * PERIOD_NS, T_world_ego), seen)
         self.frame += 1
         return out
 
@@ -79,7 +79,7 @@ def test_what_stands_is_looked_for_where_it_stood_and_what_drives_where_it_drive
             parked, drives = SE2(45.0, -5.0), SE2(20.0 + 1.4 * k, 4.0)
             seen = drive.step(SE2(0.8 * k, 0.0, 0.0), [parked, drives])
         by_side = sorted(seen, key=lambda track: float(track.state[1]))
-        assert [track.stands for track in by_side] == [True, False]
+        assert [track.is_stationary for track in by_side] == [True, False]
         found[sigma_mps] = [(math.sqrt(track.cov[2, 2]), float(track.state[2])) for track in by_side]
     (parked_before, drives_before), (parked_now, drives_now) = found.values()
     assert parked_now[0] < 0.9 * parked_before[0]
@@ -102,7 +102,7 @@ def test_after_a_gap_a_car_that_stands_takes_no_box_of_the_one_beside_it() -> No
     drive, near, tracks = Drive(noise_px=0.3), SE2(60.0, -4.0, 0.0), list[Track]()
     for k in range(22):
         tracks = drive.step(SE2(0.6 * k, 0.0, 0.0), [near])
-    assert tracks[0].stands
+    assert tracks[0].is_stationary
     for k in range(22, 24):
         drive.step(SE2(0.6 * k, 0.0, 0.0), [])
     ids = {t.vehicle for k in range(24, 27) for t in drive.step(SE2(0.6 * k, 0.0, 0.0), [SE2(61.5, -5.5, 0.0)])}
@@ -191,7 +191,7 @@ def test_a_place_by_depth_counts_by_its_covariance() -> None:
             if sigma_m is not None:
                 by_depth = DepthPlace(np.array([26.0, 1.04]), np.eye(2) * sigma_m**2, 0.0, 0.1)
             drive.ground_size.predict(0.1, 0.0, None, None)
-            tracks = drive.tracker.follow(EgoFrame(k, k * PERIOD_NS, SE2()), seen, [by_depth])
+            tracks = drive.tracker.update(EgoFrame(k, k * PERIOD_NS, SE2()), seen, [by_depth])
         (track,) = tracks
         return float(track.place.centre_m[0]), float(track.place.cov[0, 0])
 
@@ -209,8 +209,8 @@ def test_what_stands_by_its_parallax_keeps_its_yaw_while_its_size_is_learned() -
     for k in range(45):
         tracks = drive.step(SE2(0.9 * k, 0.0, 0.0), [SE2(65.0, 4.0, 0.0)])
     (track,) = tracks
-    assert track.stands
-    assert drive.tracker.placing.parallax.standing(drive.tracker.tracks.index(track)) > 0.9
+    assert track.is_stationary
+    assert drive.tracker.placing.parallax.stationary_probability(drive.tracker.tracks.index(track)) > 0.9
     assert track.yaw_rad == 0.0
     assert math.hypot(track.state[0] - 65.0, track.state[1] - 4.0) < 1.0
 
@@ -227,7 +227,7 @@ def test_a_vehicle_of_no_usual_size_keeps_its_id_while_its_size_is_learned() -> 
             box[None], np.full(1, 0.9), ("car",), CAMERA, drive.ground_size.ground, LocalisationConfig()
         )
         drive.ground_size.predict(0.1, 0.0, None, None)
-        for track in drive.tracker.follow(EgoFrame(k, k * PERIOD_NS, ego), seen):
+        for track in drive.tracker.update(EgoFrame(k, k * PERIOD_NS, ego), seen):
             ids.add(track.vehicle)
             errors.append(float((ego @ track.place.centre_m)[0]) - 70.0)
     assert ids == {0}
@@ -250,7 +250,7 @@ class Looks:
         )
         by_depth = DepthPlace(np.array([at.x_m, at.y_m]), np.eye(2), said_rad, sigma_rad, flip)
         frame = EgoFrame(self.frame, self.frame * PERIOD_NS, SE2())
-        tracks = self.drive.tracker.follow(frame, seen, [by_depth])
+        tracks = self.drive.tracker.update(frame, seen, [by_depth])
         self.frame += 1
         return tracks[0] if tracks else None
 
@@ -263,7 +263,7 @@ def test_a_car_that_never_moved_faces_as_it_looks(yaw_rad: float) -> None:
         track = looks.see(SE2(14.0, 1.0, yaw_rad), wrap(yaw_rad + 0.1 * rng.standard_normal()))
     assert track is not None
     assert abs(wrap(track.yaw_rad - yaw_rad)) < 0.1
-    assert track.yaw_known
+    assert track.is_yaw_known
     assert track.sigma_yaw_rad < 0.15
 
 
@@ -285,7 +285,7 @@ def test_an_axis_alone_leaves_a_car_headed_like_the_ego() -> None:
         track = looks.see(SE2(14.0, 1.0, 0.0), 1.0, flip=0.5)
     assert track is not None
     assert track.yaw_rad == 0.0
-    assert not track.yaw_known
+    assert not track.is_yaw_known
 
 
 def test_motion_says_which_end_is_the_front() -> None:
@@ -309,7 +309,7 @@ def test_a_car_is_not_taken_for_what_is_seen_behind_it(label: str) -> None:
         higher[None], np.array([0.9]), (label,), CAMERA, drive.ground_size.ground, LocalisationConfig()
     )
     drive.ground_size.predict(0.1, 0.0, None, None)
-    shown = drive.tracker.follow(EgoFrame(drive.frame, drive.frame * PERIOD_NS, ego), seen)
+    shown = drive.tracker.update(EgoFrame(drive.frame, drive.frame * PERIOD_NS, ego), seen)
     assert shown == []
     drive.frame += 1
     (again,) = [track for track in drive.step(ego, [car]) if track.vehicle == known.vehicle]
@@ -328,7 +328,7 @@ def test_each_filter_has_a_row_for_each_track_and_no_other() -> None:
         assert len(tracker.tracks) == len(tracker.placing.parallax) == len(tracker.ground_size)
         for row, track in enumerate(tracker.tracks):
             if track.frame.frame_id == k and track.place.assumed is not None:
-                assert track.place.assumed.standing == tracker.placing.parallax.standing(row)
+                assert track.place.assumed.standing == tracker.placing.parallax.stationary_probability(row)
 
 
 def test_a_car_that_is_lost_leaves_no_id_to_the_parked_one_beside() -> None:
@@ -364,5 +364,5 @@ def test_a_car_that_the_image_cuts_off_is_expected_to_reach_its_border(left: flo
     corners = np.vstack([np.column_stack([ego.between(track.pose()) @ footprint, np.full(4, z)]) for z in (0.0, 1.5)])
     px = bev.ego_to_pixel(CAMERA, drive.ground_size.ground, corners)
     true = np.clip([*px.min(axis=0), *px.max(axis=0)], 0.0, [1242.0, 375.0, 1242.0, 375.0])
-    (predicted,) = predicted_boxes_px([track], CAMERA, ego, drive.ground_size.ground)
+    (predicted,) = predict_boxes_px([track], CAMERA, ego, drive.ground_size.ground)
     assert iou(predicted[None], true[None])[0, 0] > 0.8

@@ -12,7 +12,7 @@ from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.vehicles.placement.localisation import DIMENSIONS, LocalisationConfig, observe_boxes
-from birdslam.vehicles.placement.uncertain_yaw import HeadingConfig, look_at_yaws
+from birdslam.vehicles.placement.uncertain_yaw import HeadingConfig, evaluate_yaws
 from birdslam.vehicles.state.yaw_by_outline import YawByOutline
 
 CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
@@ -33,7 +33,7 @@ def look(outline: YawByOutline, T_world_ego: SE2, centre_m: tuple[float, float],
     )
     depth: NDArray[np.float64] = np.array([math.log(corners[:, 0].min())])
     outline.predict(0.1, T_world_ego)
-    fan = look_at_yaws([seen], depth, (outline.grid_rad - T_world_ego.yaw_rad)[None], LOCALISATION.reach_rel)
+    fan = evaluate_yaws([seen], depth, (outline.grid_rad - T_world_ego.yaw_rad)[None], LOCALISATION.reach_rel)
     outline.weigh([0], fan.residual, fan.box_variance, np.array([SIGMA_DEPTH**2]), np.exp(depth))
 
 
@@ -46,7 +46,7 @@ def turned(a_rad: float, b_rad: float) -> float:
 @pytest.mark.parametrize("scale", [0.95, 1.0, 1.05])
 def test_driving_past_a_parked_car_tells_how_it_stands(yaw_deg: float, scale: float) -> None:
     outline, yaw_rad, told = YawByOutline(CONFIG), math.radians(yaw_deg), 0.0
-    outline.begin()
+    outline.add_vehicle()
     for k in range(30):
         look(outline, SE2(0.8 * k, 0.0, 0.0), (34.0, 6.0), yaw_rad, scale)
         told, sigma_rad = outline.estimate(0, told)
@@ -58,7 +58,7 @@ def test_driving_past_a_parked_car_tells_how_it_stands(yaw_deg: float, scale: fl
 def test_a_yaw_that_looks_like_its_mirrored_one_is_told_uncertain(yaw_deg: float) -> None:
     """Across the line of sight all outlines are as wide: driving by does not tell such a yaw from its mirror image."""
     outline, yaw_rad, told, sigma_rad = YawByOutline(CONFIG), math.radians(yaw_deg), 0.0, 0.0
-    outline.begin()
+    outline.add_vehicle()
     for k in range(30):
         look(outline, SE2(0.8 * k, 0.0, 0.0), (34.0, 6.0), yaw_rad, 1.0)
         told, sigma_rad = outline.estimate(0, told)
@@ -69,7 +69,7 @@ def test_the_same_sight_a_thousand_times_tells_no_more_than_ten_times() -> None:
     weights = []
     for frames in (20, 1000):
         outline = YawByOutline(CONFIG)
-        outline.begin()
+        outline.add_vehicle()
         for _ in range(frames):
             look(outline, SE2(), (20.0, 4.0), 0.7, 1.0)
         weights.append(outline.estimate(0, 0.0)[1])
@@ -80,7 +80,7 @@ def test_the_same_sight_a_thousand_times_tells_no_more_than_ten_times() -> None:
 def test_a_car_in_front_of_a_turning_ego_stands_along_the_way_that_follows() -> None:
     """It is first seen out of a turn, and taken to stand as the ego is headed only once the way is straight."""
     outline, told = YawByOutline(CONFIG), 0.0
-    outline.begin()
+    outline.add_vehicle()
     pose = SE2(0.0, 0.0, math.radians(-40.0))
     for k in range(30):
         look(outline, pose, (30.0, 4.0), 0.0, 1.0)
@@ -93,7 +93,7 @@ def test_a_car_in_front_of_a_turning_ego_stands_along_the_way_that_follows() -> 
 def test_rows_are_those_that_are_kept() -> None:
     outline = YawByOutline(CONFIG)
     for _ in range(3):
-        outline.begin()
+        outline.add_vehicle()
     look(outline, SE2(), (20.0, 4.0), 1.2, 1.0)
     before = outline.estimate(0, 1.2)
     outline.keep_rows([0, 2])

@@ -22,8 +22,8 @@ from birdslam.vehicles.camera_height import (
     STATES,
     BoxHeight,
     jacobian,
+    marginalise_own_errors,
     own_variance,
-    without_own_errors,
 )
 
 VEHICLES, LANES = "vehicles", "lanes"  # the cues of their sizes
@@ -121,7 +121,7 @@ def solve_mounting(
     for _ in range(6):
         equations = [_of_vehicle(rows, state, config) for rows in groups]
         A, b, own, normalised = (np.array(part) for part in zip(*equations, strict=True))
-        information, right = without_own_errors(A, b, own)
+        information, right = marginalise_own_errors(A, b, own)
         cov = np.linalg.inv(of_prior + information[inlier].sum(axis=0))
         state = cov @ (of_prior @ expected + right[inlier].sum(axis=0))
         inlier = np.abs(normalised) < config.gate_sigma

@@ -235,9 +235,9 @@ def _observe(
     margin_px = config.cut_margin_px + 0.02 * height_px
     cut_bottom = y2 > camera.height_px - margin_px
     cut_top = y1 < config.cut_margin_px
-    cut_side = x1 < config.cut_margin_px or x2 > camera.width_px - config.cut_margin_px
+    is_cut_at_side = x1 < config.cut_margin_px or x2 > camera.width_px - config.cut_margin_px
     across = factor * math.hypot(height_px * config.sigma_side_rel, px) / camera.fx_px
-    if cut_side:
+    if is_cut_at_side:
         across = math.hypot(across, 0.5 * width_px / camera.fx_px)
     return PersonBox(
         label=label,

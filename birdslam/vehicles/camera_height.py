@@ -1,11 +1,9 @@
-"""The camera's height over the road by the boxes of vehicles, and whether it is still as calibrated.
+"""Camera height over the road from the boxes of vehicles, and detection of its drift.
 
-The bottom of a box falls below the horizon by H / z (Eq. 1), its height is h / z: the vehicle's depth z drops out,
+    slope of the bottom = (H / h) * height of the box - d_pitch + d_roll * bearing        (at a depth of 1)
 
-    slope of the bottom = (H / h) * height of the box - d_pitch + d_roll * bearing        (all at a depth of 1)
-
-which is linear in the camera's height H and in its tilt, with the vehicles' heights h known by class to some per cent.
-Ground bends lengthwise and may be another one far aside, as in a car park: each vehicle has errors of its own.
+from Eq. 1 and the height h / z, without the depth z. It is linear in the camera height H and tilt. The heights h of
+vehicles are known by class; the ground under each vehicle has its own error.
 """
 
 from __future__ import annotations
@@ -27,39 +25,43 @@ from birdslam.vehicles.placement.localisation import LocalisationConfig, observe
 
 Floats = NDArray[np.float64]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
-UNRELIABLE_TILT = {Status.ODOMETRY_COASTING, Status.SCALE_CARRIED, Status.SCALE_INVALID, Status.GROUND_VIOLATED}
+UNRELIABLE_TILT_STATUSES = {  # the tilt is not measured
+    Status.ODOMETRY_COASTING,
+    Status.SCALE_CARRIED,
+    Status.SCALE_INVALID,
+    Status.GROUND_VIOLATED,
+}
 ITERATIONS = 4
 _MIN_RATIO = 0.1
-# By how much the ground under a vehicle lies off the ego's plane: as in ParallaxConfig, and the curvature of roads
-# lengthwise as in MetricScaleConfig
-_KERB_M, _CROWN_RAD, _BANK_PER_M = 0.06, 0.007, 0.001  # in the ego's lane, in proportion to y, and to y^2
-_CURVATURE_PER_M = 0.0006
-# What stands beside the road on one side has a bank in common: by 0.05 rad in a street with one (docs/constants.md)
+# Ground offset under a vehicle as in ParallaxConfig, vertical curvature as in RoadScaleConfig
+_SIGMA_OFFSET_M, _SIGMA_CROWN_RAD, _SIGMA_BANK_PER_M = 0.06, 0.007, 0.001  # constant, times y, times y^2
+_SIGMA_CURVATURE_PER_M = 0.0006
+# Bank beyond the road, common to one side (docs/constants.md)
 BANK_RAD, _ROAD_HALF_WIDTH_M = 0.05, 6.0
 _MIN_INVERSE_DEPTH = 1e-3  # 1/m
 _BOX_MEMORY_S = 0.5  # as in ParallaxConfig
-STATES = 5  # H, d_pitch, d_roll, bank at the left and at the right: the first columns of `jacobian`
-_OWN = [0, 5]  # its columns in which a vehicle has errors of its own
+STATES = 5  # H, d_pitch, d_roll, bank at the left and at the right: first columns of `jacobian`
+_OWN_COLUMNS = [0, 5]  # columns with a vehicle's own errors
 
 
 class CameraHeightConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Noise of the camera's height by vehicles, and when a difference is reported."""
+    """Noise of the camera height from vehicles, and thresholds of the drift."""
 
     sigma_height_rel: Positive = 0.5  # prior, of the calibrated height
     sigma_pitch_rad: Positive = 0.004  # of the mean tilt by the images
     sigma_roll_rad: Positive = 0.01  # of the mean tilt by the images
-    sigma_class_rel: Positive = 0.04  # of the mean height of a class on a country's roads, and of a detector's boxes
-    gate_sigma: Positive = 1.5  # past it a vehicle is down-weighted (Huber)
-    max_sigma_box_rel: Positive = 0.2  # a box that is known less well is left out
-    max_vehicles: Annotated[int, msgspec.Meta(ge=2)] = 60  # the last so many
-    min_vehicles: Annotated[int, msgspec.Meta(ge=2)] = 8  # fewer report nothing
-    drift_sigma: Positive = 2.5  # a height that is off by more is reported as calibration_drift
-    drift_rel: Positive = 0.08  # a smaller difference is not reported, whatever its sigma
+    sigma_class_rel: Positive = 0.04  # of the mean height of a class in a region, and of its boxes
+    gate_sigma: Positive = 1.5  # Huber threshold of a vehicle
+    max_sigma_box_rel: Positive = 0.2  # maximum relative sigma of a box
+    max_vehicles: Annotated[int, msgspec.Meta(ge=2)] = 60  # number of last vehicles that are kept
+    min_vehicles: Annotated[int, msgspec.Meta(ge=2)] = 8  # for a report
+    drift_sigma: Positive = 2.5  # significance of calibration_drift
+    drift_rel: Positive = 0.08  # minimum difference for calibration_drift
 
 
 @dataclass(frozen=True)
 class BoxHeight:
-    """One box of one vehicle; slopes and bearing count from the camera's own optical axis, at a depth of 1."""
+    """One box of one vehicle; slopes and bearing relative to the optical axis, at a depth of 1."""
 
     vehicle: int
     slope_bottom: float
@@ -72,7 +74,7 @@ class BoxHeight:
 
 
 def jacobian(inverse_depth: Floats, bearing: Floats) -> Floats:
-    """(N, 6) of the slopes of boxes' bottoms by `STATES`, and by the road's vertical curvature up to the vehicle."""
+    """(N, 6) derivatives of the boxes' bottom slopes by `STATES` and by the road's vertical curvature."""
     z = 1.0 / np.maximum(inverse_depth, _MIN_INVERSE_DEPTH)
     beyond = np.maximum(np.abs(bearing) - _ROAD_HALF_WIDTH_M * inverse_depth, 0.0)
     banks = beyond * (bearing > 0.0), beyond * (bearing < 0.0)
@@ -80,27 +82,28 @@ def jacobian(inverse_depth: Floats, bearing: Floats) -> Floats:
 
 
 def own_variance(camera_height_m: float, sigma_height_rel: Floats, aside_m: Floats) -> Floats:
-    """(N, 2) of vehicles' own errors: of H by their size and the ground under them (m^2), of the curvature (1/m^2)."""
-    below_m2 = _KERB_M**2 + np.square(_CROWN_RAD * aside_m) + np.square(_BANK_PER_M * np.square(aside_m))
+    """(N, 2) variances of the vehicles' own errors: of H from size and ground (m^2), of the curvature (1/m^2)."""
+    below_m2 = (
+        _SIGMA_OFFSET_M**2 + np.square(_SIGMA_CROWN_RAD * aside_m) + np.square(_SIGMA_BANK_PER_M * np.square(aside_m))
+    )
     of_height = np.square(camera_height_m * sigma_height_rel) + below_m2
-    return np.column_stack([of_height, np.full(len(of_height), _CURVATURE_PER_M**2)])
+    return np.column_stack([of_height, np.full(len(of_height), _SIGMA_CURVATURE_PER_M**2)])
 
 
-def without_own_errors(information: Floats, right: Floats, variance: Floats) -> tuple[Floats, Floats]:
-    """Normal equations (N, 6, 6), (N, 6) of vehicles, of the `STATES` alone: (N, 5, 5), (N, 5).
+def marginalise_own_errors(information: Floats, right: Floats, variance: Floats) -> tuple[Floats, Floats]:
+    """Reduces normal equations (N, 6, 6), (N, 6) to the `STATES`, (N, 5, 5), (N, 5), by the Schur complement.
 
-    `variance` (N, 2) is of errors that each vehicle has in all of its boxes, in the columns `_OWN`; they are
-    marginalised (Schur's complement).
+    `variance` (N, 2) is of errors in the columns `_OWN_COLUMNS` that all boxes of a vehicle share.
     """
-    across = information[:, :STATES, _OWN]
-    own = information[:, _OWN][:, :, _OWN] + np.eye(2) / variance[:, None, :]
+    across = information[:, :STATES, _OWN_COLUMNS]
+    own = information[:, _OWN_COLUMNS][:, :, _OWN_COLUMNS] + np.eye(2) / variance[:, None, :]
     share = across @ np.linalg.inv(own)
     reduced = information[:, :STATES, :STATES] - share @ across.transpose(0, 2, 1)
-    return reduced, right[:, :STATES] - np.einsum("nij,nj->ni", share, right[:, _OWN])
+    return reduced, right[:, :STATES] - np.einsum("nij,nj->ni", share, right[:, _OWN_COLUMNS])
 
 
 def measure_heights(edges: Sequence[VehicleEdge], camera: Camera, config: LocalisationConfig) -> list[BoxHeight]:
-    """The boxes of one frame's CV edges against the camera's own axes; cut and hidden edges have wide sigmas."""
+    """The boxes of one frame's CV edges relative to the optical axis; cut and hidden edges have wide sigmas."""
     seen = observe_boxes(
         np.array([edge.box_px for edge in edges]).reshape(-1, 4),
         np.array([edge.score for edge in edges]),
@@ -126,23 +129,23 @@ def measure_heights(edges: Sequence[VehicleEdge], camera: Camera, config: Locali
 
 @dataclass
 class _NormalEquations:
-    """The boxes of one vehicle as sums of normal equations, in the columns of `jacobian`."""
+    """Summed normal equations of the boxes of one vehicle, in the columns of `jacobian`."""
 
     information: Floats  # (6, 6)
     right: Floats  # (6,)
     boxes: int
-    samples: float  # independent ones: boxes within `_BOX_MEMORY_S` err alike
+    samples: float  # number of independent boxes; errors within `_BOX_MEMORY_S` are correlated
     last_s: float
     class_rel: float
     aside_m: float  # of its last box
 
 
 class CameraHeightEstimator:
-    """update() with the CV edges of a frame and its motion; gives CALIBRATION_DRIFT when the height has changed.
+    """Robust least squares for the camera height; `update` returns CALIBRATION_DRIFT when it has changed.
 
-    Robust least squares over the vehicles seen last, each of which is one sample: it is as wrong in all its boxes.
-    State: H (m), d_pitch, d_roll, two banks (rad). Measurements: the slope of the bottom and the height of each box.
-    Read by the front end, as a status; `estimate` gives the height itself.
+    Each vehicle is one sample, since errors of its boxes are correlated. State: H (m), d_pitch, d_roll, two banks
+    (rad). Measurements: bottom slope and height of each box. Readers: the front end for the status; `estimate` has the
+    height.
     """
 
     def __init__(self, camera: Camera, config: CameraHeightConfig, localisation: LocalisationConfig) -> None:
@@ -152,22 +155,22 @@ class CameraHeightEstimator:
 
     @property
     def estimate(self) -> tuple[float, float, int]:
-        """(height over the calibrated one, its 1-sigma, vehicles)."""
+        """(ratio to the calibrated height, its 1-sigma, number of vehicles)."""
         return self._estimate
 
     def update(self, edges: Sequence[VehicleEdge], motion: Motion | None, t_s: float) -> tuple[Status, ...]:
-        """Edges of other frames than the motion's, which ends at `t_s`, are passed over."""
-        if motion is not None and _tilt_is_measured(motion):
+        """Adds the CV edges of the motion's last frame, at `t_s`; ignores edges of other frames."""
+        if motion is not None and _is_tilt_measured(motion):
             here = [edge for edge in edges if edge.frame == motion.to_frame]
             if sum(self._add(box, motion, t_s) for box in measure_heights(here, self.camera, self._localisation)):
                 self._estimate = self._solve()
         ratio, sigma_rel, vehicles = self.estimate
         cfg = self.config
-        drifted = abs(math.log(ratio)) > max(cfg.drift_rel, cfg.drift_sigma * sigma_rel)
-        return (Status.CALIBRATION_DRIFT,) if vehicles >= cfg.min_vehicles and drifted else ()
+        has_drifted = abs(math.log(ratio)) > max(cfg.drift_rel, cfg.drift_sigma * sigma_rel)
+        return (Status.CALIBRATION_DRIFT,) if vehicles >= cfg.min_vehicles and has_drifted else ()
 
     def _add(self, box: BoxHeight, motion: Motion, t_s: float) -> bool:
-        """Adds the box to the sums; False where it determines too little to be used."""
+        """Adds a box to the sums; returns False if its sigma is too large."""
         cfg, ground = self.config, motion.ground
         slope = box.slope_bottom + ground.pitch_rad - ground.roll_rad * box.bearing
         if slope <= 0.0 or box.tan_height <= 0.0:
@@ -191,13 +194,13 @@ class CameraHeightEstimator:
         return True
 
     def _solve(self) -> tuple[float, float, int]:
-        """Least squares over all vehicles, of which each has errors of its own (Huber)."""
+        """Robust least squares (Huber) over all vehicles."""
         cfg, height_m, vehicles = self.config, self.camera.height_m, list(self._vehicles.values())
-        alike = np.array([sums.boxes / sums.samples for sums in vehicles])
-        A = np.array([sums.information for sums in vehicles]) / alike[:, None, None]
-        b = np.array([sums.right for sums in vehicles]) / alike[:, None]
+        correlated = np.array([sums.boxes / sums.samples for sums in vehicles])
+        A = np.array([sums.information for sums in vehicles]) / correlated[:, None, None]
+        b = np.array([sums.right for sums in vehicles]) / correlated[:, None]
         class_rel, aside_m = np.array([(sums.class_rel, sums.aside_m) for sums in vehicles]).T
-        information, right = without_own_errors(A, b, own_variance(height_m, class_rel, aside_m))
+        information, right = marginalise_own_errors(A, b, own_variance(height_m, class_rel, aside_m))
         spread = A[:, 0, 0] / np.sqrt(information[:, 0, 0])
         sigmas = cfg.sigma_height_rel * height_m, cfg.sigma_pitch_rad, cfg.sigma_roll_rad, BANK_RAD, BANK_RAD
         prior, expected = np.diag(1.0 / np.square(sigmas)), np.append(height_m, np.zeros(STATES - 1))
@@ -212,7 +215,7 @@ class CameraHeightEstimator:
         return ratio, math.hypot(math.sqrt(float(cov[0, 0])) / (ratio * height_m), cfg.sigma_class_rel), len(vehicles)
 
 
-def _tilt_is_measured(motion: Motion) -> bool:
-    """Whether its tilt is measured: metres may be the car's own where the road is not seen."""
-    by_car_alone = SpeedSource.CAR in motion.speed_sources and SpeedSource.ROAD not in motion.speed_sources
-    return not by_car_alone and not UNRELIABLE_TILT & set(motion.status)
+def _is_tilt_measured(motion: Motion) -> bool:
+    """Whether the images measure the tilt; the scale may come from the car's own speed alone."""
+    is_from_car_alone = SpeedSource.CAR in motion.speed_sources and SpeedSource.ROAD not in motion.speed_sources
+    return not is_from_car_alone and not UNRELIABLE_TILT_STATUSES & set(motion.status)

@@ -1,9 +1,8 @@
-"""Out-of-sequence measurements: late detections are used at their own frame, as if they had come in time.
+"""Out-of-sequence measurements: late detections are processed at their own frame, in order.
 
-Tracks and filters stand at the last *settled* frame, whose detections are in or no longer awaited. Of the frames after
-it, which are open, the ego's pose, the time and the camera's pitching are kept. When detections arrive, the open frames
-up to theirs are settled in order; frames that can get none any more are settled at once, so that no later frame bears
-their work. The road under the camera in the newest frame is predicted over the open ones.
+Tracks and filters are at the last *settled* frame, whose detections are processed or no longer expected. Later frames
+are *open*: their ego pose, time and camera pitch are stored. Detections settle the open frames up to theirs. The road
+at the newest frame is predicted over the open frames.
 """
 
 from __future__ import annotations
@@ -25,14 +24,14 @@ from birdslam.vehicles.tracking import Tracker
 
 
 class OutOfSequenceConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How long a frame waits for its detections."""
+    """Parameters of the wait for detections."""
 
-    latest_ms: float = 500.0  # source time; what comes later is left out
+    latest_ms: float = 500.0  # source time after which detections are dropped
 
 
 @dataclass(frozen=True)
 class OpenFrame:
-    """What is known of a frame without its detections: the ego, and the arguments of `GroundSizeFilter.predict`."""
+    """A frame without its detections: the ego, and the arguments of `GroundSizeFilter.predict`."""
 
     ego: EgoFrame
     dt_s: float
@@ -43,19 +42,19 @@ class OpenFrame:
     vertical: VerticalCurvature | None = None
 
 
-class Beside(Protocol):
-    """Who follows others than vehicles by the same detections, over the same road."""
+class Follower(Protocol):
+    """A tracker of other road users with the same detections and road."""
 
     def settle(self, frame: OpenFrame, detections: Detections | None, road: GroundSizeFilter) -> None:
-        """The next frame in order, after the vehicles in it were localised; `road` is the one in it."""
+        """Processes the next frame in order, after its vehicles; `road` is the road at it."""
 
 
 class OutOfSequenceTracker:
-    """open_frame(), then ingest_detections(), once a frame; after both `road` is the one under the camera in it."""
+    """Calls per frame: open_frame(), then ingest_detections(); `road` is then the road at the newest frame."""
 
-    def __init__(self, tracker: Tracker, config: OutOfSequenceConfig, beside: Sequence[Beside] = ()) -> None:
+    def __init__(self, tracker: Tracker, config: OutOfSequenceConfig, followers: Sequence[Follower] = ()) -> None:
         self.tracker = tracker
-        self._beside = tuple(beside)
+        self._followers = tuple(followers)
         self.ground_size = tracker.ground_size  # at the last settled frame
         self.road = self.ground_size  # at the newest frame
         self.config = config
@@ -64,7 +63,7 @@ class OutOfSequenceTracker:
         self._used_frame = -1  # of the newest detections that were used
 
     def open_frame(self, frame: OpenFrame) -> None:
-        """A new frame. One whose number does not grow is of a source that restarted: nothing is awaited any more."""
+        """Adds a frame. If its number does not grow, the source restarted: all open frames are settled."""
         if frame.ego.frame_id <= self._newest_frame:
             self._settle_before(self._newest_frame + 1)
             self._used_frame = -1
@@ -83,11 +82,10 @@ class OutOfSequenceTracker:
         road: NDArray[np.bool_] | None = None,
         awaited_from: int = 0,
     ) -> list[Track]:
-        """The confirmed tracks that detections of `detected_frame` are of, as they were in it, ordered by id.
+        """Returns the confirmed tracks with detections in `detected_frame`, as of that frame, ordered by id.
 
-        Each detections are used once. A detector works on one image at a time, so that none come after later ones.
-        `depth` and `road`, a mask (H, W), are of the same frame, None where they are not. Of frames before
-        `awaited_from` none come after these.
+        Detections of a frame are used once, and arrive in order. `depth` and the mask `road` (H, W) are of the same
+        frame or None. No more detections arrive for frames before `awaited_from`.
         """
         tracks: list[Track] = []
         awaited = any(frame.ego.frame_id == detected_frame for frame in self._open)
@@ -113,12 +111,12 @@ class OutOfSequenceTracker:
         depth: DepthMap | None = None,
         road: NDArray[np.bool_] | None = None,
     ) -> list[Track]:
-        """The oldest open frame, with its detections or without any; `road` is to be predicted again after it."""
+        """Settles the oldest open frame, with or without detections. `road` must be predicted again afterwards."""
         frame = self._open.popleft()
         self.road = self.ground_size
         _predict(self.ground_size, frame)
         tracks = self.tracker.localise_vehicles(frame.ego, detections, depth, road)
-        for follower in self._beside:
+        for follower in self._followers:
             follower.settle(frame, detections, self.ground_size)
         return tracks
 

@@ -1,4 +1,4 @@
-"""Where the boxes of another detector are, in metres: one answer for each box, in the order in which they came."""
+"""Metric places of the boxes of another detector, one per box in their order."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from birdslam.vehicles.track import Track
 
 
 class PlacedBox(msgspec.Struct, frozen=True, kw_only=True):
-    """One box's vehicle in ego (m, x forward, y left), its velocity over the ground, and their covariances.
+    """The vehicle of a box in ego (m, x forward, y left), its velocity over the ground, and their covariances.
 
-    Of a vehicle that is reported it is what the pose graph says of it (`VehicleEstimate`). Of one that was seen too
-    seldom for that, it is the place in this frame alone, without track and velocity.
+    For a reported vehicle it is the pose graph's estimate (`VehicleEstimate`). Otherwise it is the place in this frame
+    alone, without track and velocity.
     """
 
-    x_m: float  # the centre of its footprint
+    x_m: float  # centre of the footprint
     y_m: float
-    cov: Cov2  # of these, row-major
-    yaw_rad: float  # its heading against the ego's
-    track: int | None = None  # its number; another tracker's own where it gave one
-    velocity_mps: tuple[float, float] | None = None  # in ego's axes; (0, 0) stands
+    cov: Cov2  # of x and y, row-major
+    yaw_rad: float  # heading relative to the ego
+    track: int | None = None  # track id; another tracker's own if it gave one
+    velocity_mps: tuple[float, float] | None = None  # in ego axes; (0, 0) if stationary
     velocity_cov: Cov2 | None = None
     label: str = "car"
 
@@ -43,12 +43,12 @@ class PlacedBox(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def speed_mps(self) -> float | None:
-        """Over the ground; None while no velocity is known."""
+        """Over the ground; None if the velocity is unknown."""
         return None if self.velocity_mps is None else math.hypot(*self.velocity_mps)
 
     @property
     def speed_sigma_mps(self) -> float | None:
-        """1-sigma of `speed_mps`: along the velocity, or along the less certain axis of what stands."""
+        """1-sigma of `speed_mps` along the velocity; for a stationary vehicle along the less certain axis."""
         if self.velocity_mps is None or self.velocity_cov is None:
             return None
         cov, speed_mps = np.reshape(self.velocity_cov, (2, 2)), math.hypot(*self.velocity_mps)
@@ -65,9 +65,9 @@ def place_boxes(
     people: Sequence[tuple[int, Sequence[int]]],
     estimate: Estimate,
 ) -> tuple[PlacedBox | None, ...]:
-    """What is known of each of so many boxes of one frame; None for a box of nobody on the road.
+    """Returns a place for each of `count` boxes of one frame; None for a box without a road user.
 
-    `people` are the numbers of those who were seen in it, with the rows of their boxes: a rider has two.
+    `people` has the id of each person seen in it, with the rows of the boxes: a rider has two.
     """
     reported = {user.vehicle: user for user in estimate.road_users}
     placed: list[PlacedBox | None] = [None] * count
@@ -75,24 +75,27 @@ def place_boxes(
         if track.frame.frame_id == frame_id:
             vehicle = reported.get(track.vehicle)
             placed[track.observation.row] = (
-                _seen(track) if vehicle is None else _reported(vehicle, estimate.T_world_ego)
+                _place_from_track(track) if vehicle is None else _place_from_estimate(vehicle, estimate.T_world_ego)
             )
     for person, rows in people:
         if person in reported:
             for row in rows:
-                placed[row] = _reported(reported[person], estimate.T_world_ego)
+                placed[row] = _place_from_estimate(reported[person], estimate.T_world_ego)
     return tuple(placed)
 
 
-def _seen(track: Track) -> PlacedBox:
+def _place_from_track(track: Track) -> PlacedBox:
     x_m, y_m = track.place.centre_m.tolist()
     yaw_rad = SE2(0.0, 0.0, track.frame.T_world_ego.yaw_rad).between(SE2(0.0, 0.0, track.yaw_rad)).yaw_rad
     return PlacedBox(x_m=x_m, y_m=y_m, cov=_row_major(track.place.cov), yaw_rad=yaw_rad, label=track.label)
 
 
-def _reported(vehicle: VehicleEstimate, T_world_ego: SE2) -> PlacedBox:
+def _place_from_estimate(vehicle: VehicleEstimate, T_world_ego: SE2) -> PlacedBox:
     T_ego_vehicle = T_world_ego.between(vehicle.T_world_vehicle)
-    to_ego, R_world_ego = T_ego_vehicle.rotation(), T_world_ego.rotation()  # a pose's covariance is in its own axes
+    to_ego, R_world_ego = (
+        T_ego_vehicle.rotation(),
+        T_world_ego.rotation(),
+    )  # the covariance of a pose is in its own axes
     cov = to_ego @ np.reshape(vehicle.cov, (3, 3))[:2, :2] @ to_ego.T
     velocity = R_world_ego.T @ np.asarray(vehicle.velocity_mps)
     velocity_cov = R_world_ego.T @ np.reshape(vehicle.velocity_cov, (2, 2)) @ R_world_ego

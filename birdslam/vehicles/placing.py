@@ -1,8 +1,8 @@
-"""The places of a frame's vehicles, all of them together, from everything that measures depth.
+"""Places of all vehicles of a frame from every measurement of depth.
 
-Sizes by parallax (parallax.py), Eq. 1 on all boxes against one road (ground_size_filter.py), the uncertain yaw
-(uncertain_yaw.py), and the depth where there is one (pseudolidar.py). A further source of a place with its covariance
-belongs into `Placing.locate`, beside the last; a further filter is begun in `Placing._begin`.
+Sizes by parallax (parallax.py), Eq. 1 on all boxes with one road (ground_size_filter.py), the uncertain yaw
+(uncertain_yaw.py), and the depth map if there is one (pseudolidar.py). Add a new source of places to `Placing.locate`,
+a new filter to `Placing._add_vehicles`.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from birdslam.vehicles.placement.tyre_contact import bottom_at_face
 from birdslam.vehicles.placement.uncertain_yaw import (
     HeadingConfig,
     YawPrior,
-    fan_of,
+    evaluate_yaws,
     initial_yaw_rad,
-    look_at_yaws,
+    make_fan,
     weigh_yaws,
 )
 from birdslam.vehicles.state.ground_size_filter import Depths, GroundSizeFilter
@@ -50,9 +50,9 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Assignment:
-    """An observation and the track that it is of, None for a vehicle that is new, with its place by depth.
+    """An observation with its track, None for a new vehicle, and its place by depth.
 
-    `row` is the vehicle's in `Tracker.tracks` and in each filter.
+    `row` is the row of the vehicle in `Tracker.tracks` and in each filter.
     """
 
     row: int
@@ -61,38 +61,38 @@ class Assignment:
     by_depth: DepthPlace | None = None
 
     def yaw_rad(self, T_world_ego: SE2, config: HeadingConfig) -> float:
-        """In ego; a new vehicle is headed as it looks, or as its box looks where its front was not seen."""
+        """Yaw in ego; for a new vehicle from the body, or from the shape of the box if its front is unknown."""
         if self.track is None:
-            if self.by_depth is not None and self.by_depth.front_seen:
+            if self.by_depth is not None and self.by_depth.has_front:
                 return self.by_depth.yaw_rad
             return initial_yaw_rad(self.observation, config)
         return wrap(self.track.yaw_rad - T_world_ego.yaw_rad)
 
     def yaw_uncertainty(self, config: HeadingConfig) -> tuple[float, float]:
-        """1-sigma of that yaw (rad), and the probability that it is an outlier: another yaw altogether."""
+        """1-sigma of the yaw (rad), and the probability that it is an outlier."""
         if self.track is None:
-            if self.by_depth is not None and self.by_depth.front_seen:
+            if self.by_depth is not None and self.by_depth.has_front:
                 return self.by_depth.sigma_yaw_rad, config.outlier_known
-        elif self.track.yaw_known:
+        elif self.track.is_yaw_known:
             return self.track.sigma_yaw_rad, config.outlier_known
         return config.sigma_along_road_rad, config.outlier_unknown
 
     @property
-    def yaw_known(self) -> bool:
-        """Whether motion or body have given it."""
+    def is_yaw_known(self) -> bool:
+        """Whether motion or body measured the yaw."""
         if self.track is None:
-            return self.by_depth is not None and self.by_depth.front_seen
-        return self.track.yaw_known
+            return self.by_depth is not None and self.by_depth.has_front
+        return self.track.is_yaw_known
 
     def expected_depth_m(self, T_world_ego: SE2) -> float:
-        """Of the nearest face, before it is measured: as the track predicts it, or by the height of its class."""
+        """Predicted depth of the nearest face, from the track or the height of the class."""
         if self.track is None:
             return self.observation.depth_by_height_m
         reach_m = float(self.track.place.centre_m[0]) - self.track.place.depth_m
         return max(MIN_DISTANCE_M, in_ego(T_world_ego, self.track.state[:2])[0] - reach_m)
 
     def turned_rad(self, T_world_ego: SE2) -> float:
-        """By how much the line of sight to it turned over the ground since it was last seen."""
+        """Rotation over the ground of the line of sight since the last observation."""
         if self.track is None:
             return 0.0
         before = math.atan(self.track.observation.bearing) + self.track.frame.T_world_ego.yaw_rad
@@ -101,7 +101,7 @@ class Assignment:
 
 @dataclass(frozen=True)
 class _Prediction:
-    """A frame's vehicles (N) in ego as predicted, before their boxes are used."""
+    """Predicted vehicles (N) of a frame in ego."""
 
     yaw_rad: list[float]
     centre_m: Floats  # (N, 2)
@@ -110,10 +110,10 @@ class _Prediction:
 
 
 class Placing:
-    """predict() once a frame, then locate() its vehicles.
+    """Calls per frame: predict(), then locate().
 
-    It keeps no state but that of its two filters, `Parallax` and `GroundSizeFilter`, and measures nothing itself: the
-    tracker reads its places (m, with covariances), the smoother the sizes that they were placed with.
+    Its state is that of its filters, `Parallax`, `GroundSizeFilter` and `YawByOutline`. Readers: the tracker for places
+    (m, with covariances), the smoother for the assumed sizes.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class Placing:
         pseudolidar: PseudoLidarConfig,
         heading: HeadingConfig,
     ) -> None:
-        import scipy.special  # noqa: F401  # with the tracker, not with its first box that is cut
+        import scipy.special  # noqa: F401  # imported with the tracker, not with the first cut box
 
         self.ground_size = ground_size
         self.localisation = localisation
@@ -134,20 +134,20 @@ class Placing:
         self.yaw_by_outline = YawByOutline(heading)
 
     def predict(self, dt_s: float, T_world_ego: SE2, step_cov: Floats | None) -> None:
-        """To the next frame's ego pose, with the covariance (3, 3) of the step to it."""
+        """Predicts to the ego pose of the next frame; `step_cov` (3, 3) is the covariance of the step."""
         self.parallax.predict(dt_s, T_world_ego, step_cov)
         self.yaw_by_outline.predict(dt_s, T_world_ego)
 
     def locate(self, assignments: Sequence[Assignment], T_world_ego: SE2) -> list[Place]:
-        """In ego, one place for each assignment; the road's tilt and their sizes are learned from all."""
+        """Returns one place in ego per assignment; updates the tilt of the road and the sizes."""
         assignments = self._with_face_bottoms(assignments, T_world_ego)
         expected = self._expected(assignments, T_world_ego)
-        self._begin(assignments, expected, T_world_ego)
+        self._add_vehicles(assignments, expected, T_world_ego)
         sizes = self._sizes_by_parallax(assignments, expected, T_world_ego)
         assignments = self._with_side_outliers(assignments, sizes)
         depths = _depths_by_eq_1(assignments, expected, sizes, self.ground_size)
         by_eq_1 = self._places_at(depths, assignments, expected.yaw_rad, T_world_ego)
-        # The two sources of Fig. 2 become one
+        # Fuse the two sources of Fig. 2
         fused = [fuse(where, a.by_depth, self.pseudolidar) for where, a in zip(by_eq_1, assignments, strict=True)]
         return [
             msgspec.structs.replace(
@@ -157,7 +157,7 @@ class Placing:
         ]
 
     def _with_face_bottoms(self, assignments: Sequence[Assignment], T_world_ego: SE2) -> list[Assignment]:
-        """Their boxes with the lower edges that the nearest faces have, where they end at the tyres."""
+        """Moves the lower edges of boxes that end at the tyres to the nearest face."""
         height_m = self.ground_size.ground.height_m
         out = []
         for a in assignments:
@@ -176,20 +176,20 @@ class Placing:
             yaws, np.array(centres).reshape(-1, 2), np.array(extents).reshape(-1, 2), np.array(turned, dtype=np.float64)
         )
 
-    def _begin(self, assignments: Sequence[Assignment], expected: _Prediction, T_world_ego: SE2) -> None:
-        """The vehicles that are new, each in the next row of every filter."""
+    def _add_vehicles(self, assignments: Sequence[Assignment], expected: _Prediction, T_world_ego: SE2) -> None:
+        """Adds the new vehicles, each in the next row of every filter."""
         for assignment, centre_m, yaw_rad in zip(assignments, expected.centre_m, expected.yaw_rad, strict=True):
             if assignment.track is None:
                 d = assignment.observation.dimensions
                 sigmas = d.sigma_height_rel, d.sigma_width_rel
-                self.parallax.begin(centre_m, yaw_rad, T_world_ego, math.log(d.height_m), sigmas)
-                self.ground_size.begin(assignment.observation)
-                self.yaw_by_outline.begin()
+                self.parallax.add_vehicle(centre_m, yaw_rad, T_world_ego, math.log(d.height_m), sigmas)
+                self.ground_size.add_vehicle(assignment.observation)
+                self.yaw_by_outline.add_vehicle()
 
     def _sizes_by_parallax(
         self, assignments: Sequence[Assignment], expected: _Prediction, T_world_ego: SE2
     ) -> LearnedSize:
-        """The vehicles' heights by how they grow in the image."""
+        """Heights of the vehicles from the growth of their boxes in the image."""
         seen, height_m = [a.observation for a in assignments], self.ground_size.ground.height_m
         above_roof_m = np.array([max(0.0, height_m - o.dimensions.height_m) for o in seen])
         roof_m2 = above_roof_m * expected.extent_m[:, 0] * self.ground_size.config.roof_reach_rel
@@ -200,7 +200,7 @@ class Placing:
         return self.parallax.learn_sizes([a.row for a in assignments], boxes, T_world_ego, height_m)
 
     def _with_side_outliers(self, assignments: Sequence[Assignment], sizes: LearnedSize) -> list[Assignment]:
-        """Their boxes, with the sigmas of probable outlying sides raised."""
+        """Raises the sigmas of probable outlier sides of boxes."""
         sigma_rel = self.parallax.config.sigma_side_outlier_rel * np.sqrt(sizes.side_outlier)
         out = []
         for a, (left_rel, right_rel) in zip(assignments, sigma_rel.tolist(), strict=True):
@@ -214,17 +214,17 @@ class Placing:
     def _places_at(
         self, depths: Depths, assignments: Sequence[Assignment], yaws_rad: Sequence[float], T_world_ego: SE2
     ) -> list[Place]:
-        """The places at these depths, with the uncertainty of the depths and of the yaws."""
+        """Places at these depths, with the uncertainty of depths and yaws."""
         seen = [a.observation for a in assignments]
         if not seen:
             return []
         sigma_rad, outlier = np.array([a.yaw_uncertainty(self.heading) for a in assignments]).T
         prior = YawPrior(np.array(yaws_rad), sigma_rad, outlier)
-        yaws = fan_of(prior, self.yaw_by_outline.grid_rad - T_world_ego.yaw_rad)
-        fan = look_at_yaws(seen, depths.log_depth, yaws, self.localisation.reach_rel)
+        yaws = make_fan(prior, self.yaw_by_outline.grid_rad - T_world_ego.yaw_rad)
+        fan = evaluate_yaws(seen, depths.log_depth, yaws, self.localisation.reach_rel)
         weight = weigh_yaws(fan, depths.variance, prior, self.heading)
         near = yaws.shape[1] - len(self.yaw_by_outline.grid_rad)
-        unknown = [k for k, a in enumerate(assignments) if not a.yaw_known]
+        unknown = [k for k, a in enumerate(assignments) if not a.is_yaw_known]
         if unknown:
             weight[unknown, :near] = 0.0
             weight[unknown, near:] = self.yaw_by_outline.weigh(
@@ -243,19 +243,19 @@ class Placing:
         return out
 
     def _assumed_size(self, depths: Depths, k: int, row: int, share: float) -> AssumedSize:
-        """The size that the k-th place rests on; `share` is how much of the box's variance in depth fusion has left."""
+        """Assumed size of the k-th place; `share` is the ratio of its depth variance after fusion to that before."""
         return AssumedSize(
             log_height=float(depths.log_height[k]),
             sigma_log_height=math.sqrt(float(depths.height_variance[k])),
             depth_per_height=float(depths.depth_per_height[k]) * min(share, 1.0),
-            standing=self.parallax.standing(row),
+            standing=self.parallax.stationary_probability(row),
         )
 
 
 def _depths_by_eq_1(
     assignments: Sequence[Assignment], expected: _Prediction, sizes: LearnedSize, ground_size: GroundSizeFilter
 ) -> Depths:
-    """The depths (N,) of the nearest faces, by all boxes against one road."""
+    """Depths (N,) of the nearest faces, from all boxes with one road."""
     seen, rows = [a.observation for a in assignments], [a.row for a in assignments]
     pitch_rad = ground_size.ground.pitch_rad
     depths = ground_size.estimate_depths(
@@ -267,11 +267,11 @@ def _depths_by_eq_1(
 def truncate_at_cut(
     depths: Depths, seen: Sequence[Observation], ground_size: GroundSizeFilter, tilted_rad: float
 ) -> Depths:
-    """The depths (N,), given that a box that the image's border cuts reaches at least down to where it was drawn.
+    """Conditions the depths (N,) on the lower bound of the bottom of boxes that the image border cuts.
 
-    A vehicle's true bottom lies below the border, so that its nearest face is nearer than Eq. 1 makes of the border.
-    That bound has an uncertainty; its product with the Gaussian of the depth has the moments of a probit. The road
-    tilted by `tilted_rad` since the slopes were taken.
+    The true bottom is below the border, so the face is nearer than Eq. 1 gives. The product of the uncertain bound and
+    the Gaussian of the depth has the moments of a probit. `tilted_rad` is the change of the road's tilt since the
+    slopes were taken.
     """
     bounds = {
         k: (o.slope_bottom + tilted_rad, o.sigma_cut)
@@ -280,7 +280,7 @@ def truncate_at_cut(
     }
     if not bounds:
         return depths
-    from scipy.special import erfcx  # here: only who tracks holds it (see `Placing`)
+    from scipy.special import erfcx  # lazy: only processes that track need it (see `Placing`)
 
     cut, (slope, sigma_cut) = list(bounds), np.array(list(bounds.values())).T
     sigma_slope = np.hypot(sigma_cut, ground_size.sigma_pitch_rad)
@@ -289,7 +289,7 @@ def truncate_at_cut(
     before = depths.variance[cut]
     total = before + bound_var
     bound_m = bev.meet_road(np.ones_like(slope), slope, height_m)  # Eq. 1
-    inside = (np.log(bound_m) - depths.log_depth[cut]) / np.sqrt(total)  # in sigmas; < 0: it was too far off
+    inside = (np.log(bound_m) - depths.log_depth[cut]) / np.sqrt(total)  # in sigmas; < 0: the depth was too large
     hazard = math.sqrt(2.0 / math.pi) / erfcx(-inside / math.sqrt(2.0))  # of the normal distribution
     log_depth, variance, depth_per_height = (
         array.copy() for array in (depths.log_depth, depths.variance, depths.depth_per_height)

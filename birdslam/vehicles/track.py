@@ -1,4 +1,4 @@
-"""One followed vehicle as the tracker has it, the frame that it is seen from, and how vehicles are followed."""
+"""A tracked vehicle, the frame of its observation, and the parameters of tracking."""
 
 from __future__ import annotations
 
@@ -20,37 +20,37 @@ from birdslam.vehicles.state.parallax_config import ParallaxConfig
 
 
 class TrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """When boxes are the same vehicle, and how vehicles move."""
+    """Parameters of association and of the motion model."""
 
-    min_iou: float = 0.15  # of a box with the one predicted from bird's-eye view
-    min_iou_just_seen: float = 0.4  # of one seen within `just_seen_s` and not cut by the image's border: 1 of 1,000
-    just_seen_s: float = 0.15  # boxes of a vehicle overlap less, nine of ten neighbours' do
-    gate_sigma: float = 3.0  # Mahalanobis distance in bird's-eye view past which boxes are never the same vehicle
-    birth_score: float = 0.5  # a detection must reach it to begin a track
-    confirm_hits: int = 2  # a track gets its id when it has been seen so often; KITTI tracking chose between 2 and 3
+    min_iou: float = 0.15  # with the predicted box
+    min_iou_just_seen: float = 0.4  # within `just_seen_s` and not cut by the border; lower
+    just_seen_s: float = 0.15  # overlaps are mostly with neighbours
+    gate_sigma: float = 3.0  # Mahalanobis gate in bird's-eye view
+    birth_score: float = 0.5  # minimum score of a detection to start a track
+    confirm_hits: int = 2  # number of detections until a track gets its id
     forget_unconfirmed_s: float = 0.25  # without a detection, of a track without an id
     forget_s: float = 1.0  # without a detection, of a track with an id
     sigma_accel_mps2: float = 3.0  # 1-sigma of a vehicle's acceleration
     sigma_birth_mps: float = 8.0  # 1-sigma of the velocity of a new track
-    moving_mps: float = 2.0  # a slower vehicle, or one within moving_sigma of rest, has no yaw by motion
-    moving_sigma: float = 3.0  # see moving_mps
-    moving_of_ego: float = 0.3  # nor one below this fraction of the ego's speed: errors of the ground look like motion
-    moved_along_rel: float = 0.15  # nor one that has come less far from where it was first seen, as fractions of its
-    moved_across_rel: float = 0.05  # distance then: along the line of sight, and across it
+    moving_mps: float = 2.0  # minimum speed for a yaw by motion
+    moving_sigma: float = 3.0  # and minimum significance of the speed
+    moving_of_ego: float = 0.3  # and minimum fraction of the ego speed: ground errors look like motion
+    moved_along_rel: float = 0.15  # and minimum displacement along the line of sight, as a fraction of the first
+    moved_across_rel: float = 0.05  # distance; and across the line of sight
     sigma_yaw_rate_radps: float = 0.5  # 1-sigma of a vehicle's turning
-    direction_inflation: float = 3.0  # of the sigma of the motion's direction: its errors last for many frames
-    body_yaw_inflation: float = 3.0  # of the sigma of a yaw that a network sees in the body: so do its errors
-    sigma_yaw_unknown_rad: float = 0.2  # of a CV edge's yaw before motion or a network measures it
-    sigma_yaw_moving_rad: float = 0.1  # at least, of a CV edge's yaw that is known
+    direction_inflation: float = 3.0  # of the direction's sigma: its errors are correlated over frames
+    body_yaw_inflation: float = 3.0  # of the sigma of a yaw from a network, for the same reason
+    sigma_yaw_unknown_rad: float = 0.2  # of a CV edge's yaw before it is measured
+    sigma_yaw_moving_rad: float = 0.1  # minimum of a CV edge's yaw after it is measured
     parallax: ParallaxConfig = ParallaxConfig()
     heading: HeadingConfig = HeadingConfig()
-    standing_probability: float = 0.5  # from it on, by parallax, a vehicle stands: motion does not correct its yaw
-    sigma_standing_mps: float = 2.0  # 1-sigma of the zero-velocity update of one that stands: it may start
-    late_sigma_m: float = 3.0  # a late detection whose place is less sure than that gives no edge in the present frame
+    standing_probability: float = 0.5  # by parallax, above which motion does not correct the yaw
+    sigma_standing_mps: float = 2.0  # of the zero-velocity update: the vehicle may start
+    late_sigma_m: float = 3.0  # maximum position sigma of a late detection for an edge in the current frame
 
 
 def in_vehicle_axes(cov: NDArray[np.float64], yaw_rad: float) -> tuple[float, float, float]:
-    """(xx, xy, yy) of a covariance (2, 2) in axes that are turned by `yaw_rad`, R' cov R, without arrays."""
+    """(xx, xy, yy) of a covariance (2, 2) in axes rotated by `yaw_rad`, R' cov R, without arrays."""
     (xx, xy), (_, yy) = cov.tolist()
     c, s = math.cos(yaw_rad), math.sin(yaw_rad)
     return (
@@ -62,17 +62,17 @@ def in_vehicle_axes(cov: NDArray[np.float64], yaw_rad: float) -> tuple[float, fl
 
 @dataclass(frozen=True)
 class EgoFrame:
-    """One frame and where the ego stands in it, in the odometry's world (dead reckoning since the start)."""
+    """A frame and the ego pose in it, in the odometry world (dead reckoning since the start)."""
 
     frame_id: int
     t_source_ns: int
     T_world_ego: SE2
-    step_cov: NDArray[np.float64] | None = None  # (3, 3) of the step to it, in its tangent; None without odometry
+    step_cov: NDArray[np.float64] | None = None  # (3, 3) of the step to it, in its tangent space; None without odometry
 
 
 @dataclass(frozen=True)
 class LastEdge:
-    """Where a vehicle's last CV edge left it, in the odometry's world: its next VV edge starts there."""
+    """Pose of a vehicle at its last CV edge in the odometry world, where its next VV edge starts."""
 
     frame: int
     t_ns: int
@@ -80,9 +80,9 @@ class LastEdge:
 
 
 class VehicleFilter(Protocol):
-    """States of all followed vehicles: row k is of the tracker's k-th track, from its birth until it is forgotten.
+    """States of all tracked vehicles; row k is that of the k-th track, from birth to deletion.
 
-    `Placing` appends a row to each such filter for a new vehicle; the tracker drops rows, of all of them at once.
+    `Placing` appends rows for new vehicles; the tracker removes rows from all filters at once.
     """
 
     def __len__(self) -> int: ...
@@ -92,33 +92,33 @@ class VehicleFilter(Protocol):
 
 @dataclass
 class Track:
-    """One vehicle; `state` is (x_m, y_m, vx_mps, vy_mps) of its centre in the odometry's world, `cov` (4, 4)."""
+    """One vehicle; `state` is (x_m, y_m, vx_mps, vy_mps) of its centre in the odometry world, `cov` (4, 4)."""
 
     state: NDArray[np.float64]
     cov: NDArray[np.float64]
     yaw_rad: float
-    observation: Observation  # the last one
-    place: Place  # and where it put the vehicle, in the ego of `frame`
-    first_m: NDArray[np.float64]  # (2,) where it was first seen, in the odometry's world
-    first_offset_m: NDArray[np.float64]  # (2,) from the ego to there, along the world's axes
-    frame: EgoFrame  # in which it was last seen
-    last_edge: LastEdge | None = None  # None until it has an id
-    vehicle: int = -1  # the persistent id, once confirmed
+    observation: Observation  # last observation
+    place: Place  # its place in the ego of `frame`
+    first_m: NDArray[np.float64]  # (2,) first position in the odometry world
+    first_offset_m: NDArray[np.float64]  # (2,) from the ego to it, in world axes
+    frame: EgoFrame  # of the last observation
+    last_edge: LastEdge | None = None  # None before the track has an id
+    vehicle: int = -1  # persistent id, once confirmed
     hits: int = 1
-    missed: int = 0  # times that the detector looked since and did not see it
+    missed: int = 0  # number of frames with detections since the last observation
     votes: Counter[str] = field(default_factory=Counter)
-    sigma_yaw_rad: float = 0.0  # of a yaw that motion or the body has measured
-    yaw_known: bool = False
-    front_logit: float = 0.0  # log odds that the yaw points to the front, not to the rear
-    stands: bool = False  # probably, by parallax
-    motion: MotionEdge | None = None  # VV: from its last CV edge to now, as predicted before it was seen again
+    sigma_yaw_rad: float = 0.0  # of a yaw measured by motion or body
+    is_yaw_known: bool = False
+    front_logit: float = 0.0  # log odds that the yaw points to the front
+    is_stationary: bool = False  # probably, by parallax
+    motion: MotionEdge | None = None  # VV edge from its last CV edge, as predicted before the update
 
     @property
     def label(self) -> str:
         return _most_voted(self.votes)
 
     def label_with(self, label: str) -> str:
-        """What it is called most often, with one more vote."""
+        """The most frequent label, with one more vote."""
         return self.label if label == self.label else _most_voted(self.votes + Counter((label,)))
 
     def pose(self) -> SE2:

@@ -1,8 +1,7 @@
-"""Dynamic object localisation (paper, Fig. 2): vehicles in bird's-eye view, followed through time.
+"""Dynamic object localisation (paper, Fig. 2): tracking of vehicles in bird's-eye view.
 
-`Tracker.localise_vehicles` is the paper's block: a frame's boxes are placed by two sources, the pseudo-lidar of a depth
-map and Eq. 1 on their bottom edges, and fused. They become tracks with ids that last, from which vehicle_edges.py makes
-the CV and VV edges.
+`Tracker.localise_vehicles` places the boxes of a frame by the pseudo-lidar and by Eq. 1 and fuses both. The places
+update tracks with persistent ids, from which vehicle_edges.py makes the CV and VV edges.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2, wrap
 from birdslam.perception import DepthMap, Detections
 from birdslam.types import MotionEdge
-from birdslam.vehicles.association import at_border, by_track_id, predicted_boxes_px, with_track_ids, within_gate
+from birdslam.vehicles.association import assign_track_ids, at_border, match_track_ids, predict_boxes_px, within_gate
 from birdslam.vehicles.placement.depth_fusion import DepthPlace, PseudoLidarConfig
 from birdslam.vehicles.placement.localisation import (
     MIN_DISTANCE_M,
@@ -38,16 +37,15 @@ from birdslam.vehicles.track import EgoFrame, Track, TrackingConfig, VehicleFilt
 
 Floats = NDArray[np.float64]
 
-UNSURE_SIGMA = 2.0  # a vehicle may have moved so far from where it is expected
+MAX_MOTION_SIGMAS = 2.0  # of the motion since the last observation, for association
 
 
 class Tracker:
-    """A Kalman filter of constant velocity for each vehicle.
+    """A constant-velocity Kalman filter for each vehicle.
 
-    State: x, y (m) and vx, vy (m/s) of its centre in the odometry's world (dead reckoning since the start), where a
-    parked car stands still. Measurement: the centre (m) in ego that `placing.Placing` gives, with its covariance. Read
-    by association and placing in the next frame, by `yaw_filter.YawFilter`, and by `vehicle_edges` for VV edges and for
-    detections that come late. What planners get comes from the pose graph.
+    State: x, y (m) and vx, vy (m/s) of the centre in the odometry world (dead reckoning since the start). Measurement:
+    the centre (m) in ego from `placing.Placing`, with its covariance. Readers: association and placing in the next
+    frame, `yaw_filter.YawFilter`, and `vehicle_edges`. Planners read the pose graph instead.
     """
 
     def __init__(
@@ -60,7 +58,7 @@ class Tracker:
         frustum_network: FrustumNetwork | None = None,
         first_id: int = 0,
     ) -> None:
-        from scipy.optimize import linear_sum_assignment  # only who tracks holds its 9 MB: capture and optimize don't
+        from scipy.optimize import linear_sum_assignment  # lazy: 9 MB that only the tracking process needs
 
         self._assign = linear_sum_assignment
         self.camera = camera
@@ -72,7 +70,7 @@ class Tracker:
         self.placing = Placing(ground_size, localisation, config.parallax, self.pseudolidar, config.heading)
         self.yaw = YawFilter(config, localisation, ground_size)
         self.tracks: list[Track] = []
-        self._filters: tuple[VehicleFilter, ...] = (  # with a row for each track
+        self._filters: tuple[VehicleFilter, ...] = (  # with one row per track
             self.placing.parallax,
             ground_size,
             self.placing.yaw_by_outline,
@@ -87,13 +85,13 @@ class Tracker:
         depth: DepthMap | None = None,
         road: NDArray[np.bool_] | None = None,
     ) -> list[Track]:
-        """Confirmed tracks that this frame's detections are of, with their states corrected, ordered by id.
+        """Returns the confirmed tracks with detections in this frame, ordered by id.
 
-        The ground and size filter is predicted to this frame. `depth` and `road`, a mask (H, W), are of this frame,
-        None where there are none. Without detections (no detector looked) tracks are predicted only.
+        The ground and size filter must be at this frame. `depth` and the mask `road` (H, W) are of this frame, or None.
+        Without detections, tracks are predicted only.
         """
         if detections is None:
-            return self.follow(frame, None)
+            return self.update(frame, None)
         observations = observe_boxes(
             detections.boxes_px,
             detections.scores,
@@ -105,7 +103,7 @@ class Tracker:
             detections.lower_edge,
         )
         if detections.track_ids is not None:
-            observations = with_track_ids(observations, detections.track_ids)
+            observations = assign_track_ids(observations, detections.track_ids)
         observations, by_depth = locate_by_depth(
             observations,
             detections,
@@ -116,18 +114,18 @@ class Tracker:
             road,
             self.frustum_network,
         )
-        return self.follow(frame, observations, by_depth)
+        return self.update(frame, observations, by_depth)
 
-    def follow(
+    def update(
         self,
         frame: EgoFrame,
         observations: list[Observation] | None,
         by_depth: Sequence[DepthPlace | None] = (),
     ) -> list[Track]:
-        """Confirmed tracks that the observations are of: associate, place by Eq. 1 and depth, correct, begin, delete.
+        """Predicts, associates, places, corrects, creates and deletes tracks; returns the confirmed observed ones.
 
-        `by_depth` has the place that depth gives each of the observations, or is empty. None for `observations`: no
-        detector looked at this frame.
+        `by_depth` has the place by depth of each observation, or is empty. `observations` is None if no detector
+        processed this frame.
         """
         self._predict(frame)
         for known in self.tracks:
@@ -138,7 +136,7 @@ class Tracker:
         self._correct(assignments, places, frame)
         for assignment, where in zip(assignments, places, strict=True):
             if assignment.track is None:
-                self.tracks.append(self._begin(assignment, where, frame))
+                self.tracks.append(self._start_track(assignment, where, frame))
                 self.yaw.correct_by_outline(assignment.row, self.tracks[-1], self.placing.yaw_by_outline)
         self._delete_lost(frame)
         return self._confirmed(frame)
@@ -162,7 +160,7 @@ class Tracker:
     def _assignments(
         self, frame: EgoFrame, observations: list[Observation], by_depth: Sequence[DepthPlace | None]
     ) -> list[Assignment]:
-        """The observations of known tracks, then those that begin a new one, each with its place by depth."""
+        """Assignments of observations to known tracks, then those of new tracks, each with its place by depth."""
         known = self._associate(frame.T_world_ego, observations)
         matched = {k for _, k in known}
         births = [k for k, o in enumerate(observations) if k not in matched and o.score >= self.config.birth_score]
@@ -170,23 +168,23 @@ class Tracker:
         pairs = [*known, *enumerate(births, len(self.tracks))]
         return [
             Assignment(
-                row, tracks[row], self._as_voted(tracks[row], observations[k]), by_depth[k] if by_depth else None
+                row,
+                tracks[row],
+                self._with_voted_class(tracks[row], observations[k]),
+                by_depth[k] if by_depth else None,
             )
             for row, k in pairs
         ]
 
-    def _as_voted(self, track: Track | None, seen: Observation) -> Observation:
-        """The observation with the measures of the class that its track is called most often.
-
-        What the filters have learned of it are factors of these: a car is no truck because one box is called so.
-        """
+    def _with_voted_class(self, track: Track | None, seen: Observation) -> Observation:
+        """The observation with the dimensions of its track's most frequent class."""
         label = seen.label if track is None else track.label_with(seen.label)
         if label == seen.label:
             return seen
         return msgspec.structs.replace(seen, dimensions=self.localisation.vehicles[label])
 
     def _reclassify(self, assignments: Sequence[Assignment], T_world_ego: SE2) -> None:
-        """The tracks that from these boxes on are called something else more often."""
+        """Changes the class of tracks whose most frequent label changes with these boxes."""
         for a in assignments:
             if a.track is not None and (label := a.track.label_with(a.observation.label)) != a.track.label:
                 of_class, yaw_rad = self.localisation.vehicles, a.yaw_rad(T_world_ego, self.config.heading)
@@ -195,24 +193,23 @@ class Tracker:
                 self.ground_size.reclassify(a.row, of_class[label], math.log(now / before))
 
     def _associate(self, T_world_ego: SE2, observations: list[Observation]) -> list[tuple[int, int]]:
-        """(row of a track, its observation): the most overlap of predicted and seen boxes, within the gates."""
+        """Pairs (row of a track, its observation) with the largest total overlap within the gates."""
         if not self.tracks or not observations:
             return []
         if observations[0].track_id is not None:
-            return by_track_id(self.tracks, observations)
-        predicted = predicted_boxes_px(self.tracks, self.camera, T_world_ego, self.ground_size.ground)
+            return match_track_ids(self.tracks, observations)
+        predicted = predict_boxes_px(self.tracks, self.camera, T_world_ego, self.ground_size.ground)
         overlap = np.nan_to_num(iou(predicted, np.array([o.box_px for o in observations])), nan=0.0)
-        more = overlap - self._least_overlap(predicted)[:, None]
+        more = overlap - self._min_overlaps(predicted)[:, None]
         possible = (more >= 0.0) & within_gate(self.tracks, observations, T_world_ego, self.config.gate_sigma)
-        # A track without a box costs as much as one with a box at the bound: no box is taken so that others get one
+        # A missing box costs as much as one at the bound, so that no box is shifted to another track
         rows, columns = self._assign(np.where(possible, -more, 0.0))
         return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if possible[i, j]]
 
-    def _least_overlap(self, predicted_px: Floats) -> Floats:
-        """(N,) of each track's box with the one predicted (N, 4), for it to be the same vehicle's.
+    def _min_overlaps(self, predicted_px: Floats) -> Floats:
+        """(N,) minimum overlap of an observation with each predicted box (N, 4).
 
-        Of one just seen it is that of the next box. Later it falls with the overlap that is left of two boxes that are
-        UNSURE_SIGMA of the motion since then apart.
+        After an interval without observations it decreases to the overlap of boxes that are MAX_MOTION_SIGMAS apart.
         """
         assert self._last is not None
         t_ns, T_world_ego = self._last.t_source_ns, self._last.T_world_ego
@@ -221,8 +218,8 @@ class Tracker:
         ahead, aside = np.einsum("ji,njk,ki->in", R, np.array([track.cov[2:, 2:] for track in self.tracks]), R)
         sight = (np.array([track.state[:2] for track in self.tracks]) - [T_world_ego.x_m, T_world_ego.y_m]) @ R
         depth_m = np.maximum(sight[:, 0], MIN_DISTANCE_M)
-        nearer = UNSURE_SIGMA * np.sqrt(ahead) * unseen_s / depth_m  # relative
-        shift_px = UNSURE_SIGMA * np.sqrt(aside) * unseen_s / depth_m * self.camera.fx_px
+        nearer = MAX_MOTION_SIGMAS * np.sqrt(ahead) * unseen_s / depth_m  # relative
+        shift_px = MAX_MOTION_SIGMAS * np.sqrt(aside) * unseen_s / depth_m * self.camera.fx_px
         shift = np.minimum(shift_px / np.maximum(predicted_px[:, 2] - predicted_px[:, 0], 1.0), 1.0)
         left = (1.0 - shift) / (1.0 + shift) / np.square(1.0 + nearer)
         just_seen = np.where(unseen_s <= self.config.just_seen_s, 1.0, left)
@@ -230,7 +227,7 @@ class Tracker:
         return np.where(at_border(predicted_px, self.camera), self.config.min_iou, least)
 
     def _correct(self, assignments: Sequence[Assignment], places: Sequence[Place], frame: EgoFrame) -> None:
-        """The known tracks among the assignments, all at once, by the places of their observations in this frame."""
+        """Updates the known tracks by the places of their observations, all at once."""
         known = [(a.track, a, place) for a, place in zip(assignments, places, strict=True) if a.track is not None]
         if not known:
             return
@@ -245,15 +242,18 @@ class Tracker:
         gain = cov[:, :, :2] @ information
         corrected = state + (gain @ innovation[..., None])[..., 0]
         corrected_cov = cov - gain @ S @ gain.swapaxes(1, 2)
-        stands = np.array(
-            [self.placing.parallax.standing(a.row) > self.config.standing_probability for _, a, _ in known]
+        is_stationary = np.array(
+            [
+                self.placing.parallax.stationary_probability(a.row) > self.config.standing_probability
+                for _, a, _ in known
+            ]
         )
-        self._zero_velocity_update(corrected, corrected_cov, stands)
+        self._zero_velocity_update(corrected, corrected_cov, is_stationary)
         for k, (track, assignment, seen) in enumerate(known):
             track.motion = self._predicted_motion(track, frame)
-            track.stands = bool(stands[k])
-            if track.stands and nis[k] > self.config.gate_sigma**2:
-                # Its size was estimated again, which moves its place without a motion
+            track.is_stationary = bool(is_stationary[k])
+            if track.is_stationary and nis[k] > self.config.gate_sigma**2:
+                # The size was re-estimated, which moves the place without a motion
                 track.state[:2] += innovation[k]
                 track.first_m = track.first_m + innovation[k]
                 track.cov[:2, :], track.cov[2:, :2] = 0.0, 0.0
@@ -269,14 +269,14 @@ class Tracker:
             self.yaw.correct_by_outline(assignment.row, track, self.placing.yaw_by_outline)
 
     def _zero_velocity_update(self, states: Floats, covs: Floats, which: NDArray[np.bool_]) -> None:
-        """Of `which` of the states (N, 4), in place: predicted where they stand, they take no neighbour's box."""
+        """Zero-velocity update of `which` of the states (N, 4), in place."""
         velocity_cov = covs[which, 2:, 2:] + np.eye(2) * self.config.sigma_standing_mps**2
         gain = covs[which, :, 2:] @ np.linalg.inv(velocity_cov)
         states[which] -= (gain @ states[which, 2:, None])[..., 0]
         covs[which] -= gain @ covs[which, 2:]
 
     def _predicted_motion(self, track: Track, frame: EgoFrame) -> MotionEdge | None:
-        """VV by constant velocity; None for a track without an edge yet."""
+        """VV edge by constant velocity; None for a track without a CV edge."""
         if track.last_edge is None:
             return None
         dt_s = (frame.t_source_ns - track.last_edge.t_ns) * 1e-9
@@ -291,10 +291,9 @@ class Tracker:
             cov=(xx, xy, 0.0, xy, yy, 0.0, 0.0, 0.0, (self.config.sigma_yaw_rate_radps * dt_s) ** 2),
         )
 
-    def _begin(self, assignment: Assignment, seen: Place, frame: EgoFrame) -> Track:
-        # Most traffic runs along the road: until it is seen to face or to move otherwise, it is headed as its box looks
+    def _start_track(self, assignment: Assignment, seen: Place, frame: EgoFrame) -> Track:
         observation, by_depth = assignment.observation, assignment.by_depth
-        if by_depth is not None and not by_depth.front_seen:
+        if by_depth is not None and not by_depth.has_front:
             by_depth = None
         T_world_ego = frame.T_world_ego
         R = T_world_ego.rotation()
@@ -312,12 +311,12 @@ class Tracker:
             frame=frame,
             votes=Counter({observation.label: 1}),
             sigma_yaw_rad=0.0 if by_depth is None else by_depth.sigma_yaw_rad,
-            yaw_known=by_depth is not None,
+            is_yaw_known=by_depth is not None,
             front_logit=0.0 if by_depth is None else by_depth.front_logit,
         )
 
     def _delete_lost(self, frame: EgoFrame) -> None:
-        """Tracks that were not seen for too long, with their rows in all filters."""
+        """Deletes tracks without recent observations, and their rows in all filters."""
         rows = [row for row, track in enumerate(self.tracks) if not self._is_lost(track, frame.t_source_ns)]
         if len(rows) < len(self.tracks):
             self.tracks = [self.tracks[row] for row in rows]
@@ -330,7 +329,7 @@ class Tracker:
         return (t_source_ns - track.frame.t_source_ns) * 1e-9 > patience_s
 
     def _confirmed(self, frame: EgoFrame) -> list[Track]:
-        """The tracks that were seen in this frame and often enough; a new one of them gets its id."""
+        """The confirmed tracks observed in this frame; a newly confirmed one gets its id."""
         seen_now = [
             track
             for track in self.tracks

@@ -1,7 +1,6 @@
-"""The CV and VV edges of a frame (paper, Eq. 2), from the tracks that its detections, or late ones, are of.
+"""CV and VV edges of a frame (paper, Eq. 2), from the tracks of current or late detections.
 
-Edges end in the frame at hand. A vehicle that was seen in an earlier one is moved on by its velocity, and is the less
-certain for it.
+Edges end in the current frame. A vehicle of an earlier frame is extrapolated by its velocity, with a larger covariance.
 """
 
 from __future__ import annotations
@@ -15,16 +14,16 @@ from numpy.typing import NDArray
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2, wrap
 from birdslam.types import MotionEdge, VehicleEdge
-from birdslam.vehicles.association import predicted_boxes_px
+from birdslam.vehicles.association import predict_boxes_px
 from birdslam.vehicles.track import EgoFrame, LastEdge, Track, TrackingConfig, in_vehicle_axes
 
 
 def vehicle_edges(
     tracks: list[Track], present: EgoFrame, ground: GroundPlane, camera: Camera, config: TrackingConfig
 ) -> tuple[tuple[VehicleEdge, ...], tuple[MotionEdge, ...]]:
-    """The CV and VV edges of tracks that were all seen in one frame, the present or an earlier one.
+    """CV and VV edges of tracks that were all observed in one frame, the current or an earlier one.
 
-    Edges end in `present`, over whose road `ground` the camera stands.
+    Edges end in `present`; `ground` is the road under the camera in it.
     """
     cv, vv = [], []
     late = bool(tracks) and tracks[0].frame.frame_id != present.frame_id
@@ -42,8 +41,8 @@ def vehicle_edges(
 def _vehicle_edge(track: Track, delay_ns: int, config: TrackingConfig) -> VehicleEdge:
     seen, place = track.observation, track.place
     yaw_rad = wrap(wrap(-track.frame.T_world_ego.yaw_rad) + track.yaw_rad)
-    xx, xy, yy = in_vehicle_axes(place.cov, yaw_rad)  # the tangent at the vehicle's pose
-    least_rad = config.sigma_yaw_moving_rad if track.yaw_known else config.sigma_yaw_unknown_rad
+    xx, xy, yy = in_vehicle_axes(place.cov, yaw_rad)  # in the tangent space at the vehicle's pose
+    least_rad = config.sigma_yaw_moving_rad if track.is_yaw_known else config.sigma_yaw_unknown_rad
     var_yaw = least_rad**2 + track.sigma_yaw_rad**2
     return VehicleEdge(
         vehicle=track.vehicle,
@@ -63,9 +62,9 @@ def _vehicle_edge(track: Track, delay_ns: int, config: TrackingConfig) -> Vehicl
 def _extrapolated(
     tracks: list[Track], present: EgoFrame, ground: GroundPlane, camera: Camera, config: TrackingConfig
 ) -> list[Track | None]:
-    """Tracks, all seen in one frame, as they would be had they been seen now where their velocities put them.
+    """Extrapolates tracks of one frame to the current one by their velocities.
 
-    None where one has left the view, or its velocity is not known well enough.
+    None if a vehicle left the view or its velocity is too uncertain.
     """
     dt_s, T_world_then = (present.t_source_ns - tracks[0].frame.t_source_ns) * 1e-9, tracks[0].frame.T_world_ego
     state, cov = np.array([track.state for track in tracks]), np.array([track.cov for track in tracks])
@@ -73,10 +72,10 @@ def _extrapolated(
     drift = cov[:, 2:, 2:] * dt_s**2 + np.eye(2) * (config.sigma_accel_mps2 * dt_s**2 / 2.0) ** 2
     state[:, :2] += steps
     moved = [replace(track, state=moved_to) for track, moved_to in zip(tracks, state, strict=True)]
-    boxes = predicted_boxes_px(moved, camera, present.T_world_ego, ground)
+    boxes = predict_boxes_px(moved, camera, present.T_world_ego, ground)
     known = (np.linalg.eigvalsh(drift)[:, -1] <= config.late_sigma_m**2) & np.isfinite(boxes).all(axis=1)
     R_world_then, R_now_world = T_world_then.rotation(), present.T_world_ego.rotation().T
-    # The velocity's error is correlated with that of the place that corrected it: K R is the posterior's block
+    # The velocity error is correlated with that of the place that corrected it; K R is the posterior's block
     places_cov = R_world_then @ np.array([track.place.cov for track in tracks]) @ R_world_then.T + drift
     places_cov += dt_s * (cov[:, 2:, :2] + cov[:, :2, 2:])
     places_cov = R_now_world @ places_cov @ R_now_world.T
@@ -100,7 +99,7 @@ def _extrapolated_motion(
     config: TrackingConfig,
     dt_s: float,
 ) -> MotionEdge:
-    """VV, to a later frame by the same velocity."""
+    """Extrapolates a VV edge to a later frame by the same velocity."""
     R_vehicle_world = SE2(yaw_rad=track.yaw_rad).rotation().T
     ahead_m, left_m = (R_vehicle_world @ step_m).tolist()
     cov = np.reshape(motion.cov, (3, 3)).copy()

@@ -1,1 +1,1 @@
-"""Where one frame puts a vehicle: its box by Eq. 1, its depth, its body; read `localisation` first."""
+"""Place of a vehicle from one frame: box with Eq. 1, depth, body. Read `localisation` first."""

@@ -1,8 +1,7 @@
-"""A vehicle's footprint fitted to the pseudo-lidar in its box, where no network reads the body from it.
+"""Fit of a vehicle's footprint to the pseudo-lidar in its box, without a network.
 
-The pseudo-lidar gives the depth of the visible surface in each column of the box. It is compared with the surface that
-a footprint of the class's size would show, at each of a fan of yaws. The likelihoods of the yaws give centre, yaw and
-their covariance.
+The pseudo-lidar gives the depth of the visible surface per column of the box. It is compared with the surface of a
+footprint of the class's size at each yaw of a fan. The likelihoods give centre, yaw and their covariance.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.perception import DepthMap
-from birdslam.vehicles.placement.depth_fusion import DepthPlace, PseudoLidarConfig, across_var
+from birdslam.vehicles.placement.depth_fusion import DepthPlace, PseudoLidarConfig, lateral_variance
 from birdslam.vehicles.placement.localisation import CENTRE_STEPS, Observation, line_of_sight_cov
 
 Floats = NDArray[np.float64]
@@ -23,7 +22,7 @@ Floats = NDArray[np.float64]
 def fit_footprint(
     seen: Observation, depth: DepthMap, camera: Camera, ground: GroundPlane, config: PseudoLidarConfig
 ) -> DepthPlace | None:
-    """The class's footprint fitted to the visible surface in the box's columns; `depth` in metres; None: too few."""
+    """Fits the class's footprint to the visible surface; `depth` in metres. None if there are too few columns."""
     profile = visible_surface(seen, depth, camera, ground, config)
     if profile is None:
         return None
@@ -34,7 +33,6 @@ def fit_footprint(
     yaws: Floats = np.arange(config.yaws, dtype=np.float64) * (math.pi / config.yaws) - math.pi / 2.0
     corners = footprints(seen, yaws)
     centres, squared_error = _fit_centres(seen, corners, bearings, x_m, middle_m, config)
-    # The probability of each yaw
     sigma_m = math.hypot(config.sigma_shape_rel * middle_m, config.sigma_shape_m)
     log_weight = -0.5 * squared_error / sigma_m**2 * min(config.independent_columns, len(x_m))
     log_weight -= 0.5 * _width_error(seen, corners, centres, depth.sigma_rel)
@@ -54,7 +52,7 @@ def fit_footprint(
 def visible_surface(
     seen: Observation, depth: DepthMap, camera: Camera, ground: GroundPlane, config: PseudoLidarConfig
 ) -> tuple[Floats, Floats] | None:
-    """Bearings (y / x) and x_m (C,) in ego of what the columns of a box show, the median of each over its rows."""
+    """Bearings (y / x) and x_m (C,) in ego of the surface in the columns of a box, medians over its rows."""
     x1, y1, x2, y2 = seen.box_px
     band = (x1, y1 + config.top_rel * (y2 - y1), x2, y1 + config.bottom_rel * (y2 - y1))
     rows, columns = depth.cells(band)
@@ -70,7 +68,7 @@ def visible_surface(
 
 
 def footprints(seen: Observation, yaws_rad: Floats) -> Floats:
-    """(Y, 4, 2) corners about the centre, in order around it, of the class's footprint at each yaw."""
+    """(Y, 4, 2) corners about the centre, in order, of the class's footprint at each yaw."""
     half_l, half_w = seen.dimensions.length_m / 2.0, seen.dimensions.width_m / 2.0
     around = np.array([[half_l, half_w], [-half_l, half_w], [-half_l, -half_w], [half_l, -half_w]])
     c, s = np.cos(yaws_rad), np.sin(yaws_rad)
@@ -80,7 +78,7 @@ def footprints(seen: Observation, yaws_rad: Floats) -> Floats:
 
 
 def surface_m(corners: Floats, bearings: Floats) -> Floats:
-    """(Y, C) x_m at which rays of the bearings (C,), y / x, first meet each footprint (Y, 4, 2); NaN: they pass it."""
+    """(Y, C) x_m where rays of bearings (C,), y / x, first hit each footprint (Y, 4, 2); NaN without a hit."""
     a, b = corners, np.roll(corners, -1, axis=1)
     # On an edge a + t (b - a) the ray has y = bearing * x
     at_a = a[:, :, 1, None] - bearings * a[:, :, 0, None]
@@ -102,14 +100,14 @@ def _fit_centres(
     middle_m: float,
     config: PseudoLidarConfig,
 ) -> tuple[Floats, Floats]:
-    """Centres (Y, 2) in m that fit box and surface best at each yaw, and the mean squared error there (Y,), m^2."""
+    """Best centres (Y, 2) in m at each yaw, and the mean squared error (Y,) in m^2."""
     along = middle_m + np.abs(corners[:, :, 0]).max(axis=1) / 2.0
     across = _lateral_m(seen, corners, along)
     bound = config.outlier_sigma * math.hypot(config.sigma_shape_rel * middle_m, config.sigma_shape_m)
     error = np.zeros((len(corners), len(bearings)))
     for _ in range(CENTRE_STEPS):
         model = surface_m(corners + np.stack([along, across], axis=-1)[:, None, :], bearings)
-        error = x_m - model  # NaN: the footprint is too narrow to reach this column
+        error = x_m - model  # NaN where the footprint is too narrow
         missed = np.isnan(model).all(axis=1, keepdims=True)
         shift = np.asarray(np.nanmedian(np.where(missed, 0.0, error), axis=1))
         along = np.maximum(along + shift, 1.0)
@@ -120,7 +118,7 @@ def _fit_centres(
 
 
 def _lateral_m(seen: Observation, corners: Floats, along_m: Floats) -> Floats:
-    """(Y,) where sideways footprints at a depth look as wide and as far left as the box; as `localisation.place`."""
+    """(Y,) lateral positions at which footprints match the edges of the box, as in `localisation.place`."""
     of_left, of_right = seen.sigma_left**-2, seen.sigma_right**-2
     across = seen.bearing * along_m
     for _ in range(CENTRE_STEPS):
@@ -131,7 +129,7 @@ def _lateral_m(seen: Observation, corners: Floats, along_m: Floats) -> Floats:
 
 
 def _width_error(seen: Observation, corners: Floats, centres: Floats, sigma_rel: float) -> Floats:
-    """(Y,) squares of how wide each footprint looks against the box, in sigmas of what edges, class and depth allow."""
+    """(Y,) squared error of the width of each footprint against the box, in sigmas."""
     at = corners + centres[:, None, :]
     bearings = at[:, :, 1] / np.maximum(at[:, :, 0], 0.1)
     outline = np.log(np.maximum(bearings.max(axis=1) - bearings.min(axis=1), 1e-6))
@@ -142,14 +140,14 @@ def _width_error(seen: Observation, corners: Floats, centres: Floats, sigma_rel:
 
 
 def _centre_cov(seen: Observation, centre_m: Floats, sigma_rel: float, sigma_m: float) -> Floats:
-    """(2, 2) of a centre at one yaw: the map's depth along the line of sight, the box's edges across it."""
+    """(2, 2) covariance of a centre at one yaw: depth along the line of sight, edges of the box across it."""
     x_m, y_m = centre_m.tolist()
     length_m = seen.dimensions.sigma_length_rel * seen.dimensions.length_m / 2.0
     along = (sigma_rel * x_m) ** 2 + sigma_m**2 + length_m**2
-    return line_of_sight_cov(y_m / x_m, along, across_var(seen, x_m))
+    return line_of_sight_cov(y_m / x_m, along, lateral_variance(seen, x_m))
 
 
 def _sigma_of_axis(resultant: float, step_rad: float) -> float:
-    """1-sigma of an axis whose doubled angles have this mean resultant length; no finer than the fan."""
+    """1-sigma of an axis whose doubled angles have this mean resultant length; at least the step of the fan."""
     circular = math.sqrt(max(0.0, -2.0 * math.log(max(min(resultant, 1.0), 1e-6)))) / 2.0
     return max(circular, step_rad / math.sqrt(12.0))

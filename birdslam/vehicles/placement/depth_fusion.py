@@ -1,6 +1,6 @@
-"""The two sources of a vehicle's place, its depth and Eq. 1, fused into one (paper, Fig. 2).
+"""Fusion of the two sources of a vehicle's place, depth and Eq. 1 (paper, Fig. 2).
 
-They are fused by their covariances, or by the paper's rule: the depth where the vehicle is near, Eq. 1 where it is far.
+By covariances, or by the paper's rule: depth for near vehicles, Eq. 1 for far ones.
 """
 
 from __future__ import annotations
@@ -19,31 +19,31 @@ Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 
 
 class PseudoLidarConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How depth becomes a place, and how it is weighted against Eq. 1."""
+    """Parameters of places by depth and of their fusion with Eq. 1."""
 
-    rule: Literal["covariance", "paper", "off"] = "covariance"  # how the places by depth and by Eq. 1 become one
-    near_m: Positive = 20.0  # by the paper's rule: nearer, the depth map alone; farther, Eq. 1 alone
-    top_rel: float = 0.35  # of a box's height: upper end of the rows in which a body shows, below its windows
-    bottom_rel: float = 0.8  # of a box's height: lower end of these rows, above the road before it
-    columns: Annotated[int, msgspec.Meta(ge=4, le=64)] = 16  # of the box, each with one depth
+    rule: Literal["covariance", "paper", "off"] = "covariance"  # fusion of the places by depth and by Eq. 1
+    near_m: Positive = 20.0  # of the paper's rule: below it depth alone, above it Eq. 1 alone
+    top_rel: float = 0.35  # of a box's height: first row of the body, below the windows
+    bottom_rel: float = 0.8  # of a box's height: last row of the body, above the road
+    columns: Annotated[int, msgspec.Meta(ge=4, le=64)] = 16  # per box, with one depth each
     yaws: Annotated[int, msgspec.Meta(ge=4, le=180)] = 36  # of the fan, over half a turn
-    sigma_shape_rel: Positive = 0.03  # of a depth: how well the map keeps a vehicle's shape, columns apart
-    sigma_shape_m: Positive = 0.25  # vehicles are no cuboids
-    independent_columns: Positive = 4.0  # errors of neighbouring columns go together
-    outlier_sigma: Positive = 3.0  # past it a column is taken for something else
-    least_columns: Annotated[int, msgspec.Meta(ge=2)] = 5  # with depth, to fit a body
-    least_points: Annotated[int, msgspec.Meta(ge=1)] = 40  # of a frustum that the network is asked about
-    max_range_m: Positive = 60.0  # farther vehicles are left to Eq. 1
-    gate_sigma: Positive = 3.0  # past it the covariance of two places that differ grows
-    road_near_m: Positive = 5.0  # of the road that gives an unscaled map its metres
-    road_far_m: Positive = 25.0  # and where that stretch of road ends
+    sigma_shape_rel: Positive = 0.03  # of a depth: distortion of a vehicle's shape in the map
+    sigma_shape_m: Positive = 0.25  # deviation of vehicles from cuboids
+    independent_columns: Positive = 4.0  # effective number; errors of neighbouring columns are correlated
+    outlier_sigma: Positive = 3.0  # outlier threshold of a column
+    least_columns: Annotated[int, msgspec.Meta(ge=2)] = 5  # minimum number of columns for a fit
+    least_points: Annotated[int, msgspec.Meta(ge=1)] = 40  # minimum number of points of a frustum for the network
+    max_range_m: Positive = 60.0  # maximum depth; beyond, Eq. 1 alone
+    gate_sigma: Positive = 3.0  # difference of the places above which the covariance grows
+    road_near_m: Positive = 5.0  # near end of the road that scales a non-metric map
+    road_far_m: Positive = 25.0  # far end of that road
 
 
 class DepthPlace(msgspec.Struct, frozen=True):
-    """Where the depth map puts a vehicle, in ego: its footprint's centre (2,) and yaw, with their covariances.
+    """Place of a vehicle by depth, in ego: centre of the footprint (2,) and yaw, with their covariances.
 
-    The yaw is of the axis, in (-pi/2, pi/2], where `flip` is 0.5: which end is the front is then not known. `flip` is
-    the probability that the front is the rear.
+    `flip` is the probability that front and rear are swapped. If it is 0.5, the yaw is that of the axis, in (-pi/2,
+    pi/2].
     """
 
     centre_m: Floats
@@ -51,11 +51,11 @@ class DepthPlace(msgspec.Struct, frozen=True):
     yaw_rad: float
     sigma_yaw_rad: float
     flip: float = 0.5
-    size_m: tuple[float, float, float] | None = None  # length, width, height, where they were measured
+    size_m: tuple[float, float, float] | None = None  # length, width, height, if measured
 
     @property
-    def front_seen(self) -> bool:
-        """Whether the yaw is of the front, in all likelihood, and not of the axis alone."""
+    def has_front(self) -> bool:
+        """Whether the yaw is that of the front and not of the axis only."""
         return self.flip < 0.5
 
     @property
@@ -65,33 +65,33 @@ class DepthPlace(msgspec.Struct, frozen=True):
 
 
 def fuse(by_box: Place, by_depth: DepthPlace | None, config: PseudoLidarConfig) -> Place:
-    """One place from the two sources.
+    """Fuses the two places.
 
-    By their covariances, which grow where the two differ by more than `gate_sigma`, or by the paper's rule, which asks
-    the depth. The nearest face moves with the centre.
+    By covariance, inflated if they differ by more than `gate_sigma`, or by the paper's rule. The nearest face moves
+    with the centre.
     """
     if by_depth is None or config.rule == "off":
         return by_box
     if config.rule == "paper":
         if by_box.depth_m > config.near_m:
             return by_box
-        return _moved(by_box, by_depth.centre_m, by_depth.cov)
-    # Across the line of sight both rest on the same edges of the box: the depth is all that is new
+        return _move_place(by_box, by_depth.centre_m, by_depth.cov)
+    # Across the line of sight both use the same edges of the box, so only the depth is new
     apart_m = float(by_depth.centre_m[0] - by_box.centre_m[0])
     variance = float(by_box.cov[0, 0] + by_depth.cov[0, 0])
     inflation = max(1.0, apart_m**2 / variance / config.gate_sigma**2)
     gain = by_box.cov[:, 0] / variance
     cov = by_box.cov - np.outer(gain, by_box.cov[0])
-    return _moved(by_box, by_box.centre_m + gain * apart_m, inflation * cov)
+    return _move_place(by_box, by_box.centre_m + gain * apart_m, inflation * cov)
 
 
-def _moved(place: Place, centre_m: Floats, cov: Floats) -> Place:
+def _move_place(place: Place, centre_m: Floats, cov: Floats) -> Place:
     depth_m = max(place.depth_m + float(centre_m[0] - place.centre_m[0]), 0.1)
     return Place(depth_m, centre_m, (cov + cov.T) / 2.0)
 
 
-def across_var(seen: Observation, x_m: float) -> float:
-    """Variance of the centre across the line of sight: each edge is half an outline away from it."""
+def lateral_variance(seen: Observation, x_m: float) -> float:
+    """Variance of the centre across the line of sight; each edge is half an outline away."""
     of_left, of_right = seen.sigma_left**-2, seen.sigma_right**-2
     lopsided = (of_left - of_right) / (of_left + of_right)
     half_m = lopsided * seen.dimensions.sigma_width_rel * seen.tan_width * x_m / 2.0

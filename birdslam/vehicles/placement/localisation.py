@@ -1,9 +1,8 @@
 """Vehicles in bird's-eye view from their boxes (paper, dynamic object localization).
 
-`observe_boxes` makes an `Observation` of a box: slopes and bearings against the road as it is known, with their sigmas.
-An edge that the image cuts off is no measurement, one that a nearer vehicle hides a poor one. The depths come from all
-boxes of a frame together, by Eq. 1 on their bottom edges (ground_size_filter.py). `place` then puts the centre of the
-footprint where the box's edges and the vehicle's yaw want it.
+`observe_boxes` converts a box to an `Observation`: slopes and bearings relative to the road, with sigmas. The depths
+come from all boxes of a frame together, by Eq. 1 on their bottom edges (ground_size_filter.py). `place` computes the
+centre of the footprint from the edges of the box and the yaw.
 """
 
 from __future__ import annotations
@@ -21,13 +20,13 @@ from birdslam.perception.manifest import LowerEdge
 
 
 class Dimensions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a class of vehicle measures, and how much its members differ (1-sigma, as a fraction)."""
+    """Mean dimensions of a class of vehicles, and relative 1-sigma within it."""
 
     length_m: float  # mean of the class
     width_m: float  # mean of the class
     height_m: float  # mean of the class
     sigma_length_rel: float = 0.12  # of the length
-    sigma_width_rel: float = 0.2  # of the outline across the line of sight; where it is oblique that has the length
+    sigma_width_rel: float = 0.2  # of the outline across the line of sight, which includes the length if oblique
     sigma_height_rel: float = 0.08  # of the height
 
 
@@ -38,54 +37,51 @@ DIMENSIONS = {
     "bus": Dimensions(11.0, 2.5, 3.1, sigma_length_rel=0.2, sigma_height_rel=0.1),
     "motorcycle": Dimensions(2.1, 0.8, 1.6, sigma_height_rel=0.12),
 }
-STEP_M = 0.1  # of a depth, over which a slope is taken
-MIN_DISTANCE_M = 1.0  # a nearer vehicle is out of the image
-CENTRE_STEPS = 3  # each leaves about a tenth of the error
-HIDING_FRACTION = 0.1  # of a box's side: a nearer box that covers less hides nothing
+STEP_M = 0.1  # step of a numeric derivative by depth
+MIN_DISTANCE_M = 1.0  # minimum depth of a visible vehicle
+CENTRE_STEPS = 3  # iterations; each reduces the error tenfold
+MIN_HIDING_RATIO = 0.1  # fraction of a box's side that an occluding box covers
 
 
 class LocalisationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How boxes become places; the class table also lists which labels are vehicles."""
+    """Parameters of places from boxes; the class table lists the labels of vehicles."""
 
     vehicles: dict[str, Dimensions] = msgspec.field(default_factory=lambda: dict(DIMENSIONS))
-    sigma_box_rel: float = 0.02  # 1-sigma of a box's edges as a fraction of its size, where its detector states none
-    sigma_box_px: float = 0.4  # and beside it
-    # By how much of itself the 1-sigma of edges grows as the score falls from `sure_score` to 0: boxes of YOLOX-nano,
-    # vehicle-detection-adas-0002 and the shipped network on KITTI tracking 0005's images, and RRC's on 0001 to 0020,
-    # err 1.5 to 2.5 times as much at scores of 0.4 to 0.6 as at 0.9
+    sigma_box_rel: float = 0.02  # 1-sigma of the edges as a fraction of the box, without a detector value
+    sigma_box_px: float = 0.4  # and a constant part
+    # Relative growth of the edge noise as the score falls from `sure_score` to 0
     sigma_growth: float = 2.0
-    sure_score: float = 0.9  # see sigma_growth
-    reach_rel: float = 1.0  # of the way from the nearest face to the centre; the paper stays at the face (0)
-    sigma_cut_rel: float = 1.0  # an edge cut by the image is anywhere within the box
-    # Of a vehicle at the image's side: a box narrower than this, of its outline's width, lacks a part of its length
+    sure_score: float = 0.9  # score above which the noise is not increased
+    reach_rel: float = 1.0  # factor on the distance from face to centre; the paper uses the face (0)
+    sigma_cut_rel: float = 1.0  # 1-sigma of an edge cut by the image, as a fraction of the box
+    # At the image sides: relative width below which a part of the length is assumed hidden
     cut_width_rel: float = 0.7
-    cut_length_rel: float = 1.0  # of its length: what it lacks, by how much narrower its box is
-    sigma_reach_side_rel: float = 0.3  # 1-sigma of the way to its centre, of that way, where its lower edge is seen
-    sigma_reach_cut_rel: float = 0.5  # and where the image's bottom cuts it too
-    sigma_hidden_rel: float = 0.025  # an edge behind a nearer vehicle is the detector's guess
-    cut_margin_px: float = 4.0  # an edge so near to the image's border counts as cut
-    # of the box's height, at the image's bottom: detectors draw a cut edge a little inside of it
+    cut_length_rel: float = 1.0  # hidden length per missing width
+    sigma_reach_side_rel: float = 0.3  # 1-sigma of the distance from face to centre if the lower edge is visible
+    sigma_reach_cut_rel: float = 0.5  # and if the image bottom cuts it
+    sigma_hidden_rel: float = 0.025  # 1-sigma of an occluded edge
+    cut_margin_px: float = 4.0  # distance to the border within which an edge counts as cut
+    # At the image bottom, of the height: detectors draw cut edges slightly inside
     cut_margin_rel: float = 0.1
-    cut_margin_side_rel: float = 0.05  # of the box's width, at the image's sides
-    overhang_rel: float = 0.2  # of the length: from a body's end to its next axle, by how vehicles are built
-    clearance_m: float = 0.2  # from the road to the body's lower edge, by how cars are built
-    shape_floor_m: float = 0.02  # across the line of sight: vehicles are no cuboids
-    max_above_road_rad: float = 0.06  # a box whose bottom lies farther above where its height puts it is left out
-    same_vehicle_iou: float = 0.6  # boxes of different classes on one vehicle: the better score stays
-    max_range_m: float = 100.0  # by the height of its class
+    cut_margin_side_rel: float = 0.05  # at the image sides, of the box's width
+    overhang_rel: float = 0.2  # distance from the end of a body to its axle, of the length
+    clearance_m: float = 0.2  # height of the lower edge of the body over the road
+    shape_floor_m: float = 0.02  # minimum lateral 1-sigma: vehicles are not cuboids
+    max_above_road_rad: float = 0.06  # maximum angle of the bottom above the road at the depth by height
+    same_vehicle_iou: float = 0.6  # overlap above which boxes of different classes are one vehicle
+    max_range_m: float = 100.0  # by the height of the class
 
     @property
     def edge_sigma(self) -> EdgeSigma:
-        """Of the boxes of a detector that does not state its own."""
+        """Edge noise of detectors that do not state their own."""
         return EdgeSigma((self.sigma_box_rel,) * 4, self.sigma_box_px)
 
 
 class Observation(msgspec.Struct, frozen=True):
     """One vehicle's box in one frame.
 
-    `left` and `right` are the bearings (y/x in ego) of its edges at the bottom. Slopes (-z/x in ego) count downwards
-    from the plane of the road, so that Eq. 1 puts the bottom edge at x = H / slope_bottom. The sigmas are standard
-    deviations of these numbers.
+    `left` and `right` are the bearings (y/x in ego) of its edges at the bottom. Slopes (-z/x in ego) are positive below
+    the road's horizon, so Eq. 1 puts the bottom edge at x = H / slope_bottom. Sigmas are standard deviations.
     """
 
     label: str
@@ -99,49 +95,48 @@ class Observation(msgspec.Struct, frozen=True):
     sigma_bottom: float
     slope_top: float
     sigma_top: float
-    cut_side: bool
+    is_cut_at_side: bool
     dimensions: Dimensions
-    sigma_cut: float | None = None  # of slope_bottom where the image cuts the bottom off: the true one is no less
-    row: int = 0  # of its box among those that it was observed in
-    on_tyres: bool = False  # the bottom is that of the tyres, and not of the nearest face (tyre_contact.py)
-    track_id: int | None = None  # of another tracker's track, whose associations are kept
+    sigma_cut: float | None = None  # of slope_bottom if the image cuts the bottom; a lower bound
+    row: int = 0  # index of its box
+    is_bottom_at_tyres: bool = False  # the bottom is at the tyres, not at the nearest face (tyre_contact.py)
+    track_id: int | None = None  # id of another tracker
 
     @property
     def bearing(self) -> float:
-        """Of its middle column."""
+        """Bearing of the middle column."""
         return (self.left + self.right) / 2.0
 
     @property
     def tan_width(self) -> float:
-        """Its width at a depth of 1."""
+        """Width at a depth of 1."""
         return self.left - self.right
 
     @property
     def tan_height(self) -> float:
-        """Its height at a depth of 1."""
+        """Height at a depth of 1."""
         return self.slope_bottom - self.slope_top
 
     @property
     def depth_by_height_m(self) -> float:
-        """Of a vehicle as tall as its class."""
+        """Depth for the mean height of the class."""
         return self.dimensions.height_m / max(self.tan_height, 1e-3)
 
 
 class AssumedSize(msgspec.Struct, frozen=True):
-    """The size that a vehicle was placed with, for the smoother (rts_smoother.py): later frames know the size better.
+    """Size used for a place; the smoother (rts_smoother.py) corrects it by a later, better size.
 
-    `log_height` is the logarithm of its height in metres, `depth_per_height` the derivative of the logarithm of its
-    depth by it.
+    `log_height` is the log of the height (m), `depth_per_height` the derivative of the log depth by it.
     """
 
     log_height: float
     sigma_log_height: float
     depth_per_height: float
-    standing: float  # the probability that it stands
+    standing: float  # probability of being stationary
 
 
 class Place(msgspec.Struct, frozen=True):
-    """Where an observed vehicle is in ego: its nearest face's depth, its footprint's centre (2,), and cov (2, 2)."""
+    """Place of an observed vehicle in ego: depth of the nearest face, centre of the footprint (2,), cov (2, 2)."""
 
     depth_m: float
     centre_m: NDArray[np.float64]
@@ -150,7 +145,7 @@ class Place(msgspec.Struct, frozen=True):
 
 
 def iou(a_px: NDArray[np.float64], b_px: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Intersection over union, (A, B), of boxes (A, 4) and (B, 4) given as x1, y1, x2, y2."""
+    """Intersection over union (A, B) of boxes (A, 4) and (B, 4), as x1, y1, x2, y2."""
     a, b = np.reshape(a_px, (-1, 1, 4)), np.reshape(b_px, (1, -1, 4))
     span = np.maximum(np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2]), 0.0)
     shared = span[..., 0] * span[..., 1]
@@ -161,9 +156,9 @@ def iou(a_px: NDArray[np.float64], b_px: NDArray[np.float64]) -> NDArray[np.floa
 
 
 def corners_of(dimensions: Dimensions, yaw_rad: float, size: float = 1.0) -> list[tuple[float, float]]:
-    """The footprint's corners about its centre, in ego's axes; `yaw_rad` is the vehicle's against the ego.
+    """Corners of the footprint about its centre, in ego axes; `yaw_rad` is the yaw in ego.
 
-    `size` is a factor of its length and width.
+    `size` is a factor on length and width.
     """
     c, s = size * math.cos(yaw_rad), size * math.sin(yaw_rad)
     half_l, half_w = dimensions.length_m / 2.0, dimensions.width_m / 2.0
@@ -172,7 +167,7 @@ def corners_of(dimensions: Dimensions, yaw_rad: float, size: float = 1.0) -> lis
 
 
 def extent_m(dimensions: Dimensions, yaw_rad: float, depth_m: float, bearing: float) -> tuple[float, float]:
-    """(extent along ego's x, width of its outline as seen at the depth of its nearest face) of a vehicle, in metres."""
+    """(extent along ego x, width of the outline at the depth of the nearest face) of a vehicle, in metres."""
     corners = corners_of(dimensions, yaw_rad)
     reach_m = _reach_m(corners)
     x_m = depth_m + reach_m
@@ -184,7 +179,7 @@ def extent_m(dimensions: Dimensions, yaw_rad: float, depth_m: float, bearing: fl
 
 
 def _reach_m(corners: list[tuple[float, float]]) -> float:
-    """From the nearest corner to the centre, along ego's x."""
+    """Distance from the nearest corner to the centre along ego x."""
     (a, _), (b, _), (c, _), (d, _) = corners
     return -min(a, b, c, d)
 
@@ -192,11 +187,9 @@ def _reach_m(corners: list[tuple[float, float]]) -> float:
 def centre_at(
     seen: Observation, depth_m: float, yaw_rad: float, config: LocalisationConfig
 ) -> tuple[float, float, float, float]:
-    """(x, y, reach, outline): the footprint's centre in ego by `place`, how far it lies behind the nearest face, in
-    metres, and the width of its outline at a depth of 1.
+    """(x, y, reach, outline): centre in ego, its distance behind the nearest face (m), outline at a depth of 1.
 
-    The middle of an oblique vehicle's outline is not the column of its centre: the centre is moved sideways until the
-    bearings of its outermost corners have those of the box's edges, each weighted by its information.
+    The centre is moved laterally until the outermost corners match the edges of the box, weighted by their information.
     """
     corners = corners_of(seen.dimensions, yaw_rad, config.reach_rel)
     reach_m = _reach_m(corners)
@@ -215,42 +208,40 @@ def centre_at(
 
 
 def place(seen: Observation, log_depth: float, var_depth: float, yaw_rad: float, config: LocalisationConfig) -> Place:
-    """The observation's place in ego at a depth with its variance, both of the logarithm; yaw against the ego."""
+    """Place of an observation in ego, from log depth with its variance and the yaw in ego."""
     depth_m = math.exp(log_depth)
     x_m, y_m, reach_m, outline = centre_at(seen, depth_m, yaw_rad, config)
     slope = y_m / x_m
-    if seen.cut_side and reach_m > 0.0:  # the paper stays at the face
-        # What is seen of it is narrower than its outline: the rest is beside the ego, nearer than what is seen
+    if seen.is_cut_at_side and reach_m > 0.0:  # the paper uses the face
+        # The visible part is narrower than the outline; the rest is beside the ego, nearer
         narrower = max(0.0, config.cut_width_rel - seen.tan_width / outline)
         hidden_m = min(config.cut_length_rel * narrower, 1.0) * 2.0 * reach_m
         nearest_m = max(depth_m - hidden_m, MIN_DISTANCE_M)
         x_m, y_m, reach_m, _ = centre_at(seen, nearest_m, yaw_rad, config)
-        # The one edge that is seen is a corner's, behind the centre: the centre moves along that edge's line of sight
+        # The visible edge is a corner behind the centre: the centre moves along its line of sight
         farther_x_m, farther_y_m, *_ = centre_at(seen, nearest_m + STEP_M, yaw_rad, config)
         slope = (farther_y_m - y_m) / (farther_x_m - x_m)
     of_left, of_right = seen.sigma_left**-2, seen.sigma_right**-2
 
-    # An edge alone gives the centre as well as half of the outline is known; of a vehicle that leaves the image at its
-    # side the nearest face is not seen
+    # A single edge gives the centre with the uncertainty of half the outline
     lopsided = (of_left - of_right) / (of_left + of_right)
     half_outline = max(seen.tan_width, outline) / 2.0
-    if seen.cut_side:
-        # The depth's part of it is along that edge's line of sight: what is left is half its extent aside
+    if seen.is_cut_at_side:
+        # The depth error is along that edge's line of sight; the lateral rest is half the extent
         half_outline = max(y for _, y in corners_of(seen.dimensions, yaw_rad)) / x_m
     sigma_half = seen.dimensions.sigma_width_rel * half_outline
     sigma_across = math.hypot(
         1.0 / math.sqrt(of_left + of_right), lopsided * sigma_half, config.shape_floor_m / max(x_m, 1.0)
     )
     sigma_reach_rel = seen.dimensions.sigma_length_rel
-    if seen.cut_side:
+    if seen.is_cut_at_side:
         sigma_reach_rel = config.sigma_reach_side_rel if seen.sigma_cut is None else config.sigma_reach_cut_rel
-    # x_m = depth_m + reach_m, and the depth's error is of the face: the centre does not move by more
     along = depth_m**2 * var_depth + (sigma_reach_rel * reach_m) ** 2
     return Place(depth_m, np.array([x_m, y_m]), line_of_sight_cov(slope, along, (x_m * sigma_across) ** 2))
 
 
 def line_of_sight_cov(slope: float, along: float, across: float) -> NDArray[np.float64]:
-    """(2, 2) of variances of x along a line of sight y = `slope` x, and of y at that x."""
+    """(2, 2) covariance from the variance of x along a line of sight y = `slope` x, and that of y at fixed x."""
     return np.array([[along, along * slope], [along * slope, along * slope**2 + across]])
 
 
@@ -264,10 +255,10 @@ def observe_boxes(
     edge_sigma: EdgeSigma | None = None,
     lower_edge: LowerEdge = "body",
 ) -> list[Observation]:
-    """Observations of the vehicles among the boxes (N, 4) with scores (N,), best score first.
+    """Observations of the vehicles among boxes (N, 4) with scores (N,), best score first.
 
-    A box that floats above the road or lies past `max_range_m` is left out. `edge_sigma` is what the detector states,
-    None the configuration's; `lower_edge` where its boxes end (`manifest.DetectorTable`).
+    Boxes that float above the road or lie beyond `max_range_m` are dropped. `edge_sigma` is the detector's, or None for
+    the configured one; `lower_edge` states where its boxes end (`manifest.DetectorTable`).
     """
     vehicles = np.array([label in config.vehicles for label in labels], dtype=np.bool_).reshape(-1)
     sizes = boxes_px[:, 2:] - boxes_px[:, :2]
@@ -282,21 +273,21 @@ def observe_boxes(
     boxes = boxes_px[chosen]
     hidden = hidden_edges(boxes)
     slopes = _slopes(camera, ground, boxes)
-    sigma, on_tyres = edge_sigma or config.edge_sigma, lower_edge == "tyres"
+    sigma, is_bottom_at_tyres = edge_sigma or config.edge_sigma, lower_edge == "tyres"
     found = (
-        _observe(i, box, float(scores[i]), labels[i], camera, slope, edges, sigma, on_tyres, config)
+        _observe(i, box, float(scores[i]), labels[i], camera, slope, edges, sigma, is_bottom_at_tyres, config)
         for i, box, slope, edges in zip(chosen.tolist(), boxes.tolist(), slopes.tolist(), hidden.tolist(), strict=True)
     )
     return [seen for seen in found if _is_on_road(seen, ground, config)]
 
 
 def hidden_edges(boxes_px: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """(N, 3): whether the left, right and bottom edge of each box lie behind a nearer one, whose bottom is lower."""
+    """(N, 3) whether left, right and bottom edge of each box are occluded by a nearer box with a lower bottom."""
     x1, y1, x2, y2 = (boxes_px[:, k, None] for k in range(4))
     n1, m1, n2, m2 = (boxes_px[None, :, k] for k in range(4))
     nearer = m2 > y2
-    rows = np.maximum(np.minimum(y2, m2) - np.maximum(y1, m1), 0.0) > HIDING_FRACTION * (y2 - y1)
-    columns = np.maximum(np.minimum(x2, n2) - np.maximum(x1, n1), 0.0) > HIDING_FRACTION * (x2 - x1)
+    rows = np.maximum(np.minimum(y2, m2) - np.maximum(y1, m1), 0.0) > MIN_HIDING_RATIO * (y2 - y1)
+    columns = np.maximum(np.minimum(x2, n2) - np.maximum(x1, n1), 0.0) > MIN_HIDING_RATIO * (x2 - x1)
     left = nearer & rows & (n1 < x1) & (n2 > x1)
     right = nearer & rows & (n1 < x2) & (n2 > x2)
     bottom = nearer & columns & (m1 < y2)
@@ -305,7 +296,7 @@ def hidden_edges(boxes_px: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def _slopes(camera: Camera, ground: GroundPlane, boxes_px: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(N, 4): bearings of the left and right edge at the bottom, slopes of bottom and top (the rays of Eq. 1)."""
+    """(N, 4) bearings of the left and right edge at the bottom, slopes of bottom and top (rays of Eq. 1)."""
     px = np.concatenate([boxes_px[:, [0, 3]], boxes_px[:, [2, 3]], boxes_px[:, [0, 1]]])
     left, right, top = bev.bearing_and_slope(camera, ground, px).reshape(3, -1, 2)
     return np.column_stack([left[:, 0], right[:, 0], left[:, 1], top[:, 1]])
@@ -320,7 +311,7 @@ def _observe(
     slopes: list[float],
     hidden: list[bool],
     edge_sigma: EdgeSigma,
-    on_tyres: bool,
+    is_bottom_at_tyres: bool,
     config: LocalisationConfig,
 ) -> Observation:
     x1, y1, x2, y2 = box
@@ -351,11 +342,11 @@ def _observe(
         sigma_bottom=sigma_px(height_px, of_bottom, cut_bottom, hidden_bottom) / camera.fy_px,
         slope_top=slopes[3],
         sigma_top=sigma_px(height_px, of_top, cut_top, False) / camera.fy_px,
-        cut_side=cut_left or cut_right,
+        is_cut_at_side=cut_left or cut_right,
         dimensions=config.vehicles[label],
         sigma_cut=sigma_px(height_px, of_bottom, False, False) / camera.fy_px if cut_bottom else None,
         row=row,
-        on_tyres=on_tyres,
+        is_bottom_at_tyres=is_bottom_at_tyres,
     )
 
 

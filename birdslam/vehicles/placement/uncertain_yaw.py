@@ -1,9 +1,7 @@
-"""A vehicle's place with the uncertainty of its yaw marginalised out.
+"""Marginalization of the uncertain yaw of a vehicle.
 
-The width of a box, at a depth, measures how much a vehicle is turned, not to which side. Each yaw of a fan puts the
-footprint's centre elsewhere; the posterior over the fan, from the yaw's prior and the width, gives the centre's mean
-and covariance. Nothing is kept from frame to frame: the yaws (rad) are `yaw_filter.YawFilter`'s, the log depths
-`ground_size_filter.GroundSizeFilter`'s, and `placing.Placing` reads the result.
+The width of a box at a depth measures the yaw, but not its sign. Each yaw of a fan gives another centre; the posterior
+over the fan, from the prior of the yaw and the width, gives mean and covariance of the centre.
 """
 
 from __future__ import annotations
@@ -22,36 +20,32 @@ from birdslam.vehicles.placement.localisation import CENTRE_STEPS, LocalisationC
 Floats = NDArray[np.float64]
 Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 
-_GAUSS_HERMITE = np.array([0.0, math.sqrt(3.0), -math.sqrt(3.0)])  # points of a normal distribution, in sigmas
+_GAUSS_HERMITE = np.array([0.0, math.sqrt(3.0), -math.sqrt(3.0)])  # sigma points of a normal distribution
 _GAUSS_HERMITE_WEIGHT = np.array([2.0, 0.5, 0.5]) / 3.0
 _MIN_WEIGHT = 1e-12
 
 
 class HeadingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How vehicles stand on roads, and how well the width of a box measures it."""
+    """Priors of the heading of vehicles, and the noise of the width of a box."""
 
-    outlier_unknown: Share = 0.25  # of the vehicles whose yaw was not measured yet: they are headed anywhere
-    outlier_known: Share = 0.1  # of those whose motion or body measured it: it may be wrong
-    sigma_along_road_rad: float = 0.05  # of the others of the first kind: they are headed like the ego
-    sigma_width_rel: float = 0.09  # of the outline of a footprint, among vehicles of a class
-    # Of the vehicles, when first seen: they stand or drive across the ego's road. By the labels of KITTI tracking 0000
-    # to 0020 43 of 343 do
-    across: Share = 0.1
-    fan: Annotated[int, msgspec.Meta(ge=4, le=90)] = 36  # yaws over half a turn: the opposite has the same outline
-    # Of the vehicles: along the ego's way no more than across it. By the labels of KITTI tracking 31 of 296 cars are
-    # turned by 10 to 70 degrees at their first sight of 25 px
-    oblique: Share = 0.1
-    sigma_across_rad: float = 0.2  # of those across the ego's way
-    bend_m: float = 5.0  # of the way, over which its bend is known
-    box_memory_s: float = 0.5  # for so long the width of a box has the same error
-    least_width_rel: float = 0.03  # 1-sigma of a box's width, at least
+    outlier_unknown: Share = 0.25  # of vehicles without a measured yaw
+    outlier_known: Share = 0.1  # of vehicles with a yaw by motion or body
+    sigma_along_road_rad: float = 0.05  # 1-sigma about the road, of the inliers without a measured yaw
+    sigma_width_rel: float = 0.09  # of the outline of footprints of a class
+    across: Share = 0.1  # fraction of vehicles across the road, at the first observation
+    fan: Annotated[int, msgspec.Meta(ge=4, le=90)] = 36  # number of yaws over half a turn
+    oblique: Share = 0.1  # fraction of vehicles neither along nor across the road
+    sigma_across_rad: float = 0.2  # of vehicles across the road
+    bend_m: float = 5.0  # distance over which the curvature of the path is averaged
+    box_memory_s: float = 0.5  # correlation time of the width of boxes
+    least_width_rel: float = 0.03  # minimum 1-sigma of the width of a box
 
 
 @dataclass(frozen=True)
 class YawPrior:
-    """Of the yaws (N,) of a frame's vehicles against the ego: a normal distribution mixed with a uniform one.
+    """Prior of the yaws (N,) in ego: a mixture of a normal and a uniform distribution.
 
-    `outlier` (N,) is the weight of the uniform one.
+    `outlier` (N,) is the weight of the uniform part.
     """
 
     yaw_rad: Floats
@@ -60,12 +54,11 @@ class YawPrior:
 
 
 def initial_yaw_rad(seen: Observation, config: HeadingConfig) -> float:
-    """Against the ego, of a vehicle whose yaw nothing has measured: along the road or, by the shape of its box, across.
+    """Initial yaw in ego: along the road or, by the aspect ratio of the box, across it.
 
-    A car from the side is 2.5 times as wide as high, one from behind as wide as high: the shape of its box needs no
-    depth. One that the image's border cuts is taken to stand along the road.
+    The aspect ratio needs no depth. A vehicle cut by the image border is assumed to be along the road.
     """
-    if seen.cut_side or seen.sigma_cut is not None:
+    if seen.is_cut_at_side or seen.sigma_cut is not None:
         return 0.0
     d, tan_height, across_rad = seen.dimensions, max(seen.tan_height, 1e-3), math.pi / 2.0
     sigmas = (
@@ -85,10 +78,10 @@ def initial_yaw_rad(seen: Observation, config: HeadingConfig) -> float:
 
 @dataclass(frozen=True)
 class YawFan:
-    """Where the centres (N, M, 2) in ego of boxes (N,) would be at each of the yaws of a fan.
+    """Centres (N, M, 2) in ego of boxes (N,) at each yaw of a fan.
 
-    `residual` (N, M): by how much the log of a box's width exceeds the log of its footprint's outline at that yaw;
-    `box_variance` (N,) is that of the log width.
+    `residual` (N, M) is log(width of the box / outline of the footprint) at that yaw; `box_variance` (N,) is the
+    variance of the log width.
     """
 
     centres_m: Floats
@@ -96,14 +89,14 @@ class YawFan:
     box_variance: Floats
 
     def marginalised(self, weight: Floats) -> tuple[Floats, Floats]:
-        """Shift (N, 2) from the first yaw's centre to the mean one, its covariance (N, 2, 2), by `weight` (N, M)."""
+        """Shift (N, 2) from the first yaw's centre to the mean, and its covariance (N, 2, 2), with weights (N, M)."""
         mean = (weight[..., None] * self.centres_m).sum(axis=1)
         away = self.centres_m - mean[:, None]
         return mean - self.centres_m[:, 0], (weight[..., None] * away).swapaxes(1, 2) @ away
 
 
-def look_at_yaws(seen: Sequence[Observation], log_depth: Floats, yaws: Floats, reach_rel: float) -> YawFan:
-    """The fan of boxes whose nearest faces are at `log_depth` (N,), at the yaws (N, M) against the ego."""
+def evaluate_yaws(seen: Sequence[Observation], log_depth: Floats, yaws: Floats, reach_rel: float) -> YawFan:
+    """Fan of boxes with nearest faces at `log_depth` (N,), at yaws (N, M) in ego."""
     left, right, var_left, var_right, half_l, half_w = np.array(
         [
             (
@@ -118,7 +111,7 @@ def look_at_yaws(seen: Sequence[Observation], log_depth: Floats, yaws: Floats, r
         ]
     ).T[..., None]
 
-    # Corners about the centre, (4, N, M): the last two are opposite to the first
+    # Corners about the centre, (4, N, M); the last two are opposite to the first
     c, s = np.cos(yaws), np.sin(yaws)
     ahead = np.stack([half_l * c - half_w * s, half_l * c + half_w * s])
     aside = np.stack([half_l * s + half_w * c, half_l * s - half_w * c])
@@ -137,15 +130,15 @@ def look_at_yaws(seen: Sequence[Observation], log_depth: Floats, yaws: Floats, r
     return YawFan(np.stack([x_m, y_m], axis=-1), residual, box_variance)
 
 
-def fan_of(yaws_prior: YawPrior, fan_rad: Floats) -> Floats:
-    """(N, 3 + F): the points of each prior's normal distribution, the mean first, then its fan (N, F) or (F,)."""
+def make_fan(yaws_prior: YawPrior, fan_rad: Floats) -> Floats:
+    """(N, 3 + F): sigma points of each prior's normal distribution, the mean first, then its fan (N, F) or (F,)."""
     n = len(yaws_prior.yaw_rad)
     near = yaws_prior.yaw_rad[:, None] + yaws_prior.sigma_rad[:, None] * _GAUSS_HERMITE
     return np.hstack([near, np.broadcast_to(fan_rad, (n, fan_rad.shape[-1]))])
 
 
 def weigh_yaws(fan: YawFan, variance: Floats, yaws_prior: YawPrior, config: HeadingConfig) -> Floats:
-    """(N, M) of a fan as `fan_of` has it: its posterior by the widths of the boxes, at depths of this log variance."""
+    """(N, M) posterior of a fan of `make_fan`, from the widths of the boxes and the variance of the log depths."""
     outlier, many = yaws_prior.outlier[:, None], fan.residual.shape[1] - len(_GAUSS_HERMITE)
     uniform = np.broadcast_to(outlier / many, (len(outlier), many))
     prior = np.hstack([(1.0 - outlier) * _GAUSS_HERMITE_WEIGHT, uniform])
@@ -162,12 +155,12 @@ def marginalise_yaw(
     localisation: LocalisationConfig,
     config: HeadingConfig,
 ) -> tuple[Floats, Floats]:
-    """(N, 2) m in ego: how far the mean centre lies from the centre at the mean yaw; its covariance (N, 2, 2) by yaw.
+    """Shift of the centre (N, 2) from that at the mean yaw (m, ego), and its covariance (N, 2, 2) due to yaw.
 
-    `log_depth` (N,) is of the nearest faces, with its `variance`; of the yaws nothing but their prior is known.
+    `log_depth` (N,) of the nearest faces has the `variance` (N,); the yaws have only their prior.
     """
     if not seen:
         return np.zeros((0, 2)), np.zeros((0, 2, 2))
-    yaws = fan_of(yaws_prior, np.arange(config.fan, dtype=np.float64) * (math.pi / config.fan))
-    fan = look_at_yaws(seen, log_depth, yaws, localisation.reach_rel)
+    yaws = make_fan(yaws_prior, np.arange(config.fan, dtype=np.float64) * (math.pi / config.fan))
+    fan = evaluate_yaws(seen, log_depth, yaws, localisation.reach_rel)
     return fan.marginalised(weigh_yaws(fan, variance, yaws_prior, config))

@@ -1,7 +1,7 @@
-"""The measurements of the boxes in `ground_size_filter.GroundSizeFilter`, and what a state expects of them.
+"""Measurement model of the boxes in `ground_size_filter.GroundSizeFilter`.
 
-z is the depth of the nearest face, r on to the roof's far edge, y/x the box's bearing, H the camera's height; the road
-rises by pitch + tilt + v (z - PLANE_AT_M) / 2 - roll y/x - crown |y|/x, v its vertical curvature:
+z is the depth of the nearest face, r the distance on to the roof's far edge, y/x the bearing, H the camera height; the
+road rises by pitch + tilt + v (z - PLANE_AT_M) / 2 - roll y/x - crown |y|/x with the vertical curvature v:
 
     bottom = (H + edge) / z - rise      (Eq. 1)            top = (H - h) / (z + r) - rise
     log width = log w + log(class's outline) - log z
@@ -18,22 +18,22 @@ from birdslam.geometry import bev
 
 Floats = NDArray[np.float64]
 
-# States of all vehicles: tilt of the camera over the road, its crown, lasting errors of the images' tilt, what the
-# sizes and what the lower edges have in common, the road's vertical curvature
+# Common states: tilt of the camera over the road, its crown, systematic errors of the tilt by images, common errors of
+# sizes and of lower edges, vertical curvature
 PITCH, ROLL, CROWN, IMAGE_PITCH, IMAGE_ROLL, SIZE, LOWER, VERTICAL = range(8)
-COMMON, OWN = 8, 4  # and of each vehicle:
+COMMON, OWN = 8, 4  # numbers of common states, and of states per vehicle
 HEIGHT, OUTLINE, EDGE, TILT = range(OWN)
 Cue = Literal["bottom", "top", "width"]
-CUES: tuple[Cue, ...] = ("bottom", "top", "width")  # measurements of each box, in this order
+CUES: tuple[Cue, ...] = ("bottom", "top", "width")  # measurements per box, in this order
 
 
 def expected_boxes(
     x: Floats, at: NDArray[np.intp], bearing: Floats, reach: Floats, height_m: float, tilt_rad: Floats
 ) -> tuple[Floats, Floats]:
-    """The measurements (3 N,) expected of a state (M + N,), cue by cue, and their derivatives (3 N, M + N) by it.
+    """Expected measurements (3 N,) of a state (M + N,), cue by cue, and their Jacobian (3 N, M + N).
 
-    `at` (N,) is where the state has each box's vehicle, its last N numbers are the logs of the depths. Slopes are
-    against a ground of `tilt_rad` (pitch, roll); `height_m` is the camera's.
+    `at` (N,) is the index of each box's vehicle in the state; its last N entries are the log depths. Slopes are
+    relative to a ground of `tilt_rad` (pitch, roll); `height_m` is the camera height.
     """
     n = len(at)
     m = len(x) - n
@@ -63,10 +63,10 @@ def expected_boxes(
 
 
 def robust_information(S: Floats, innovation: Floats, gate_sigma: float) -> Floats:
-    """The inverse of the innovations' covariance S (M, M), with the worst cue of each box at a robust weight (Huber).
+    """Inverse of the innovation covariance S (M, M), with a robust weight (Huber) on each box's worst cue.
 
-    Innovations (M,) stand cue by cue, of all boxes each. One differs from its prediction by all the others by
-    (S^-1 v)_i / (S^-1)_ii, with the variance 1 / (S^-1)_ii: past `gate_sigma` its noise is raised.
+    Innovations (M,) are ordered cue by cue. The innovation given all others is (S^-1 v)_i / (S^-1)_ii with variance 1 /
+    (S^-1)_ii; beyond `gate_sigma` its noise is raised.
     """
     whole = np.asarray(np.linalg.inv(S), dtype=np.float64)
     precision = np.diag(whole)

@@ -1,10 +1,10 @@
-"""The road's tilt and the vehicles' sizes, each from the other, by the boxes of the vehicles alone.
+"""Joint Kalman filter of the road's tilt and the vehicles' sizes, from the boxes of the vehicles.
 
     x = [pitch, roll, crown, errors of the images' tilt, common size and edge, vertical curvature,
          and of every vehicle: log h, log w, edge, tilt]      and, for one frame only, of every box: log z
 
-One Kalman filter holds them all. What is wrong as long as a drive or a track lasts is a state of the drive or of the
-track, so that many frames don't average it away. Measurements: ground_measurements.py; states: docs/road-users.md.
+Systematic errors of a drive or a track are states, so that they do not average out over frames. Measurements:
+ground_measurements.py; states: docs/road-users.md.
 """
 
 from __future__ import annotations
@@ -45,18 +45,18 @@ from birdslam.vehicles.state.size_prior import MIN_VARIANCE, SizePrior
 Floats = NDArray[np.float64]
 
 ITERATIONS = 2
-BEND_ITERATIONS = 5
-LEVEL_VARIANCE = 1e-16  # of the vertical curvature where lanes say nothing: the road is taken for a plane
-DEPTH_UNKNOWN = 2.0  # 1-sigma of log z before a frame is seen
-UNUSED = 1e3  # 1-sigma of a cue that is not used
+CURVATURE_ITERATIONS = 5
+FLAT_VARIANCE = 1e-16  # of the vertical curvature without lanes: the road is a plane
+INITIAL_DEPTH_SIGMA_LOG = 2.0
+UNUSED_SIGMA = 1e3  # 1-sigma of an unused cue
 _TILTS, _ROAD, _IMAGES = slice(PITCH, ROLL + 1), slice(PITCH, CROWN + 1), slice(IMAGE_PITCH, IMAGE_ROLL + 1)
 _MIN_DT_S = 1e-3
-_MIN_SHARE = 1e-6  # of a second, that counts as driving
+_MIN_DRIVING_RATIO = 1e-6  # minimum driving fraction of a second
 
 
 @dataclass(frozen=True)
 class Depths:
-    """Of one frame's boxes, (N,) each: logs of the nearest faces' depths and of the vehicles' heights, in metres."""
+    """One frame's boxes, (N,) each: log depth of the nearest face and log height of the vehicle, in metres."""
 
     log_depth: Floats
     variance: Floats
@@ -66,25 +66,24 @@ class Depths:
 
 
 class GroundSizeFilter:
-    """predict() once a frame, then estimate_depths() of its boxes.
+    """Calls per frame: predict(), then estimate_depths().
 
-    State: pitch and roll (rad) of the camera over the road, by how much its sides fall off (rad), and lasting errors of
-    the images' tilt; the log of a factor on all heights, and where all boxes end as a share of the height; of each
-    vehicle the log of its height in metres, the log of its outline's width as a factor, its edge (m) and tilt (rad).
-    Measurements: of each box the slopes of bottom and top and the log of its width (see the module); pitch and roll
-    (rad) by the images. `placing.Placing` reads depths and heights; `ground` is read by `localisation.observe_boxes`,
-    by association, and by the front end's lanes and landmarks.
+    State: pitch and roll (rad) of the camera over the road, crown (rad), systematic errors of the tilt by images;
+    common log factor on heights, common offset of lower edges relative to the height; of each vehicle log height (m),
+    log factor on the width of its outline, edge (m) and tilt (rad). Measurements: bottom and top slopes and log width
+    of each box; pitch and roll (rad) by images. Readers: `placing.Placing` for depths and heights;
+    `localisation.observe_boxes`, association, lanes and landmarks for `ground`.
     """
 
     def __init__(self, camera: Camera, config: GroundSizeConfig) -> None:
         self.camera = camera
         self.config = config
-        self._unseen_s = np.zeros(0)  # of each vehicle
-        self._driven_s = np.zeros(0)  # and how much of that counts as driving of the ego
+        self._unseen_s = np.zeros(0)  # since the last observation of each vehicle
+        self._driven_s = np.zeros(0)  # driving time of the ego in it
         self._sigma_tilt = np.zeros(0)
         self._x = np.array([camera.pitch_rad, camera.roll_rad, *np.zeros(COMMON - 2)])
         common = np.square([config.sigma_common_rel, config.sigma_common_edge_rel])
-        self._P = np.diag([*config.road_var, *config.image_var, *common, LEVEL_VARIANCE])
+        self._P = np.diag([*config.road_var, *config.image_var, *common, FLAT_VARIANCE])
         self._sizes = SizePrior(config.sigma_common_rel, config.size_dof)
         self._image_ground = camera.ground
 
@@ -93,7 +92,7 @@ class GroundSizeFilter:
 
     @property
     def ground(self) -> GroundPlane:
-        """The estimate of the road under the camera."""
+        """Estimated road under the camera."""
         return GroundPlane(self._image_ground.height_m, float(self._x[PITCH]), float(self._x[ROLL]))
 
     @property
@@ -103,48 +102,48 @@ class GroundSizeFilter:
 
     @property
     def sigma_pitch_rad(self) -> float:
-        """1-sigma of its pitch."""
+        """1-sigma of the ground's pitch."""
         return math.sqrt(float(self._P[PITCH, PITCH]))
 
     @property
     def vertical_per_m(self) -> float:
-        """The road's vertical curvature; > 0: it rises ahead, over `ground` (`PLANE_AT_M`)."""
+        """The road's vertical curvature; > 0 if it rises ahead, over `ground` (`PLANE_AT_M`)."""
         return float(self._x[VERTICAL])
 
     @property
     def sigma_vertical_per_m(self) -> float:
-        """1-sigma of it."""
+        """1-sigma of the vertical curvature."""
         return math.sqrt(float(self._P[VERTICAL, VERTICAL]))
 
     @property
     def tilt_cov(self) -> Floats:
-        """(2, 2) of its pitch and roll."""
+        """(2, 2) covariance of the ground's pitch and roll."""
         return self._P[_TILTS, _TILTS]
 
     def size(self, row: int) -> tuple[float, float]:
-        """(height_m, factor of the outline's width) as learned of a vehicle."""
+        """(height_m, factor on the width of the outline) of a vehicle."""
         at = COMMON + OWN * row
         return math.exp(float(self._x[at + HEIGHT])), math.exp(float(self._x[at + OUTLINE]))
 
     def without_vehicles(self) -> GroundSizeFilter:
-        """A copy without vehicles, to predict the road further while this one stays."""
+        """A copy without vehicles, to predict the road further."""
         ground = copy.copy(self)
         ground._unseen_s, ground._driven_s, ground._sigma_tilt = np.zeros(0), np.zeros(0), np.zeros(0)
         ground._sizes = self._sizes.without_vehicles()
         ground._x, ground._P = self._x[:COMMON].copy(), self._P[:COMMON, :COMMON].copy()
         return ground
 
-    def begin(self, seen: Observation) -> None:
-        """A vehicle seen for the first time, in the next row: of its class's size until boxes correct it."""
+    def add_vehicle(self, seen: Observation) -> None:
+        """Adds a vehicle in the next row, with the size of its class."""
         config, dimensions = self.config, seen.dimensions
         self._unseen_s, self._driven_s = (np.append(s, config.box_memory_s) for s in (self._unseen_s, self._driven_s))
         sigma_edge_m = math.hypot(config.sigma_kerb_m, config.sigma_edge_rel * dimensions.height_m)
         self._sigma_tilt = np.append(
             self._sigma_tilt, math.hypot(config.sigma_tilt_rad, config.sigma_crown_rad * seen.bearing)
         )
-        share, own_var = self._sizes.begin(dimensions.height_m, dimensions.sigma_height_rel)
+        share, own_var = self._sizes.add_vehicle(dimensions.height_m, dimensions.sigma_height_rel)
         n = len(self._x)
-        birth = np.zeros((n + OWN, n))  # log h = log h_class + common + own: what is known of `common` is known of it
+        birth = np.zeros((n + OWN, n))  # log h = log h_class + common + own
         birth[:n] = np.eye(n)
         birth[n + HEIGHT, SIZE], birth[n + EDGE, LOWER] = share, dimensions.height_m
         self._x = birth @ self._x + np.append(np.zeros(n), [math.log(dimensions.height_m), 0.0, 0.0, 0.0])
@@ -165,11 +164,11 @@ class GroundSizeFilter:
         travelled_m: float | None = None,
         vertical: VerticalCurvature | None = None,
     ) -> None:
-        """To the next frame: `turn_rad` the camera's own pitching (nose down > 0), None where it is not known.
+        """Predicts to the next frame; `turn_rad` is the camera's pitch change (nose down > 0), or None.
 
-        `image_ground` is the road by the images, None where they don't measure it, `image_cov` (2, 2) that of its pitch
-        and roll. `travelled_m` is the ego's way, None where it is not known: it is taken to drive. `vertical` is the
-        road's vertical curvature by the lanes, None where they don't measure it.
+        `image_ground` is the road by images with the covariance `image_cov` (2, 2) of pitch and roll, or None.
+        `travelled_m` is the distance of the ego; None is treated as driving. `vertical` is the road's vertical
+        curvature by lanes, or None.
         """
         config = self.config
         share = 1.0 if travelled_m is None else self._driving_share(travelled_m / max(dt_s, _MIN_DT_S))
@@ -191,26 +190,26 @@ class GroundSizeFilter:
         step = config.sigma_pitch_blind_rad if turn_rad is None else config.sigma_pitch_step_rad
         noise[PITCH] += share * step**2
         self._P[np.diag_indices_from(self._P)] += noise
-        self._bend(vertical)
+        self._set_vertical_curvature(vertical)
         if image_ground is not None and image_cov is not None and image_ground != self._image_ground:
             self._image_ground = image_ground
-            self._correct_tilt(image_ground, image_cov / max(share, _MIN_SHARE))
+            self._correct_tilt(image_ground, image_cov / max(share, _MIN_DRIVING_RATIO))
 
     def rescale_outline(self, row: int, log_outline: float) -> None:
-        """The vehicle's yaw was corrected, so that its class's outline grows by exp(log_outline); its box does not."""
+        """Compensates a yaw correction that scales the class's outline by exp(log_outline)."""
         at = COMMON + OWN * row + OUTLINE
         self._x[at] -= log_outline
         self._P[at, at] += (self.config.width_turned_rel * log_outline) ** 2
 
     def reclassify(self, row: int, dimensions: Dimensions, log_outline: float) -> None:
-        """The vehicle is of another class: of that one is its height's prior, whose outline is greater by a factor."""
+        """Replaces the prior of the height by that of another class, with an outline larger by exp(log_outline)."""
         at = COMMON + OWN * row
         height = dimensions.height_m, dimensions.sigma_height_rel
         self._x, self._P = self._sizes.replace(row, self._x, self._P, (at + HEIGHT, SIZE), *height)
         self._x[at + OUTLINE] -= log_outline
 
     def keep_rows(self, rows: Sequence[int]) -> None:
-        """Forget the vehicles of all other rows; what was learned of the road from them stays."""
+        """Removes the vehicles of all other rows; the road stays."""
         at = [*range(COMMON), *(COMMON + OWN * row + k for row in rows for k in range(OWN))]
         self._unseen_s, self._driven_s = self._unseen_s[rows], self._driven_s[rows]
         self._sigma_tilt = self._sigma_tilt[rows]
@@ -226,12 +225,11 @@ class GroundSizeFilter:
         turned_rad: Floats,
         learned: LearnedSize | None = None,
     ) -> Depths:
-        """The depths of all of this frame's boxes (N) together; the filter learns tilt and sizes from them.
+        """Returns the depths of all boxes (N) of this frame; updates tilt and sizes.
 
-        `outlines_m` and `extents_m` (N,): what each class measures across and along the line of sight at its yaw;
-        `turned_rad` (N,): by how much that line turned since last seen. Observations are against the present `ground`.
-        `learned` (N, K), sizes by parallax, counts in the depths that are returned and is not kept: the parallax filter
-        gives it again in each frame.
+        `outlines_m` and `extents_m` (N,) are the class's extent across and along the line of sight at its yaw;
+        `turned_rad` (N,) is the rotation of the line of sight since the last observation. Observations are relative to
+        the current `ground`. `learned` (N, K), sizes by parallax, affects the returned depths but not the state.
         """
         n = len(seen)
         if not n:
@@ -246,7 +244,7 @@ class GroundSizeFilter:
         sigma_width = np.array([math.hypot(o.sigma_left, o.sigma_right) / o.tan_width for o in seen])
         z = np.concatenate([slopes, tops, log_width - np.log(outlines_m)])
         R0 = np.concatenate([sigma_slope[:, 0] ** 2, sigma_slope[:, 1] ** 2, sigma_width**2])
-        R0[np.repeat([cue not in self.config.cues for cue in CUES], n)] = UNUSED**2
+        R0[np.repeat([cue not in self.config.cues for cue in CUES], n)] = UNUSED_SIGMA**2
         log_z, P_z, log_h, P_h, P_zh = self._iterate(
             at, bearing, extents_m * self.config.roof_reach_rel, z, R0, self._correlated_frames(rows, learned)
         )
@@ -268,24 +266,23 @@ class GroundSizeFilter:
         car that is seen from behind doubles within 30 degrees.
         """
         config = self.config
-        own_turn = 0.0 if learned is None else config.bend_per_m * learned.speed_mps  # in a second
+        own_turn = 0.0 if learned is None else config.bend_per_m * learned.speed_mps  # per second
         own_var = np.square(own_turn) * self._unseen_s[rows]
         out: Floats = config.width_drift_rel**2 + config.width_turn_rel**2 * (np.square(turned_rad) + own_var)
         return out
 
     def _driving_share(self, speed_mps: float) -> float:
-        """The share of a second that counts as driving."""
+        """Driving fraction of a second."""
         return -math.expm1(-speed_mps / self.config.driving_mps)
 
     def _correlated_frames(self, rows: Sequence[int], learned: LearnedSize | None) -> Floats:
-        """(N,): how many frames in a row have the same error, by how much changed in view since each was last seen.
+        """(N,) number of consecutive frames with the same error, from the change of view since the last observation.
 
-        Errors of a box become others as the ego drives or as the vehicle does. Of what stands before an ego that stands
-        all images are the same one, and it was counted.
+        Errors of a box decorrelate as ego or vehicle move. While both are stationary, all images show the same error.
         """
         speed_mps = np.zeros(len(rows)) if learned is None else learned.speed_mps
-        stood_s = (self._unseen_s - self._driven_s)[rows] * np.exp(-speed_mps / self.config.driving_mps)
-        changed_s = np.maximum(self._unseen_s[rows] - stood_s, _MIN_SHARE)
+        stationary_s = (self._unseen_s - self._driven_s)[rows] * np.exp(-speed_mps / self.config.driving_mps)
+        changed_s = np.maximum(self._unseen_s[rows] - stationary_s, _MIN_DRIVING_RATIO)
         correlated: Floats = np.maximum(1.0, self.config.box_memory_s / changed_s)
         self._unseen_s[rows] = self._driven_s[rows] = 0.0
         return correlated
@@ -295,17 +292,16 @@ class GroundSizeFilter:
     ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
         """log z and its variances, log h and its variances, and their covariances, (N,) each.
 
-        They have this frame's boxes with their noise R. The state that is kept for the next frame has them with so much
-        more noise that errors which last are not averaged away.
+        They use this frame's boxes with noise R. The stored state uses inflated noise, for correlated errors.
         """
         n, m = len(at), len(self._x)
         ground = self._image_ground.height_m, self._x[_TILTS].copy()
-        # First guess of the depth: by the prior height from the height of the box
+        # Initial depth from the prior height and the height of the box
         log_z = self._x[at] - np.log(np.maximum(z[:n] - z[n : 2 * n], 1e-3))
         prior = np.concatenate([self._x, log_z])
         P = np.zeros((m + n, m + n))
         P[:m, :m] = self._P
-        P[range(m, m + n), range(m, m + n)] = DEPTH_UNKNOWN**2
+        P[range(m, m + n), range(m, m + n)] = INITIAL_DEPTH_SIGMA_LOG**2
         x = prior.copy()
         for iteration in range(ITERATIONS):
             expected, J = expected_boxes(x, at, bearing, reach, *ground)
@@ -327,7 +323,7 @@ class GroundSizeFilter:
         return x[m:], np.diag(P)[m:].copy(), x[at], np.maximum(P[at, at], MIN_VARIANCE), P[range(m, m + n), at]
 
     def _correct_tilt(self, by_images: GroundPlane, cov: Floats) -> None:
-        """By pitch and roll from the images: those of the road, with the errors of the images that last."""
+        """Updates with pitch and roll by images, which have systematic errors."""
         sigma_rel = np.array([self.config.image_pitch_sigma_rel, 1.0])
         PHt = self._P[:, _TILTS] + self._P[:, _IMAGES]
         gain = PHt @ np.linalg.inv(PHt[_TILTS] + PHt[_IMAGES] + cov * np.outer(sigma_rel, sigma_rel))
@@ -338,31 +334,29 @@ class GroundSizeFilter:
         P[VERTICAL] = P[:, VERTICAL]
         self._P = (P + P.T) / 2.0
 
-    def _bend(self, by_lanes: VerticalCurvature | None) -> None:
-        """The road's vertical curvature: boxes suffer from its error, and don't correct it (Schmidt).
+    def _set_vertical_curvature(self, by_lanes: VerticalCurvature | None) -> None:
+        """Sets the vertical curvature from lanes; boxes do not correct it (Schmidt-Kalman filter).
 
-        Boxes that end a little too low, or cars that are all a little taller than their class, look like a sag: taught
-        by boxes, it made real roads worse.
+        A common offset of the lower edges or of the heights looks like a sag.
         """
         config = self.config
-        mean, variance = 0.0, LEVEL_VARIANCE
+        mean, variance = 0.0, FLAT_VARIANCE
         if by_lanes is not None:
-            mean, variance = bend_of(by_lanes, config.sigma_vertical_per_m, config.vertical_dof)
+            mean, variance = estimate_curvature(by_lanes, config.sigma_vertical_per_m, config.vertical_dof)
         ratio = math.sqrt(variance / self._P[VERTICAL, VERTICAL])
         self._P[VERTICAL] *= ratio
         self._P[:, VERTICAL] *= ratio
-        self._P[VERTICAL, VERTICAL] = variance  # free of the rounding
+        self._P[VERTICAL, VERTICAL] = variance  # without rounding errors
         self._x[VERTICAL] = mean
 
 
-def bend_of(by_lanes: VerticalCurvature, scale_per_m: float, dof: float) -> tuple[float, float]:
-    """(mean, variance) of a road's vertical curvature by the lanes' and by what roads do, Student's t.
+def estimate_curvature(by_lanes: VerticalCurvature, scale_per_m: float, dof: float) -> tuple[float, float]:
+    """(mean, variance) of the vertical curvature, from lanes and a Student's t prior of roads.
 
-    Most roads are flat, and hills are ten of their sigmas: the t lets the lanes tell a hill, and holds a small bend to
-    be none. Its weight is found by fixed-point iterations (expectation maximisation).
+    The t allows hills and suppresses small curvatures. Its weight is found by fixed-point iterations (EM).
     """
     mean, variance = by_lanes.per_m, by_lanes.sigma_per_m**2
-    for _ in range(BEND_ITERATIONS):
+    for _ in range(CURVATURE_ITERATIONS):
         of_roads = (dof * scale_per_m**2 + mean**2) / (dof + 1.0)
         variance = 1.0 / (1.0 / of_roads + by_lanes.sigma_per_m**-2)
         mean = variance * by_lanes.per_m / by_lanes.sigma_per_m**2

@@ -1,10 +1,9 @@
-"""How large vehicles are and whether they stand, from how they grow in the image as the ego drives.
+"""Size and stationarity of vehicles from the growth of their boxes as the ego moves.
 
-A box that grows from 20 to 40 pixels while the ego comes 30 m nearer is of a car that is 30 m away, however large cars
-are, if it stands. Kalman filters, one for each mode of motion, are mixed by how well each predicts the measurements
-(interacting multiple model, Blom and Bar-Shalom 1988):
+If a stationary vehicle's box doubles over 30 m of ego motion, the vehicle is 30 m away, whatever its size. One Kalman
+filter per motion mode, mixed by likelihood (interacting multiple model, Blom and Bar-Shalom 1988):
 
-    x = [x, y, vx, vy, log h, log w, tilt, kerb]        parallax_measurements.py has the box's equations
+    x = [x, y, vx, vy, log h, log w, tilt, ground offset]        measurements: parallax_measurements.py
 """
 
 from __future__ import annotations
@@ -18,13 +17,13 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.se2 import SE2
 from birdslam.vehicles.state.motion_modes import (
-    ANOTHER,
     FILTERS,
     MODES,
-    MOVING,
-    STANDING,
+    MOVING_MODES,
+    NEIGHBOUR,
     STATIONARY,
-    UNUSUAL,
+    STATIONARY_MODES,
+    UNUSUAL_SIZE,
     WITHOUT_GROUND,
     birth_velocity_cov,
     birth_weights,
@@ -38,8 +37,8 @@ from birdslam.vehicles.state.parallax_measurements import (
     CUES,
     GROUND,
     HEIGHT,
-    KERB,
     MIN_SLOPE,
+    OFFSET,
     STATES,
     TILT,
     VX,
@@ -55,18 +54,18 @@ from birdslam.vehicles.state.side_outliers import update_with_side_outliers
 
 Floats = NDArray[np.float64]
 
-UNKNOWN = 1e6  # variance of a size that motion does not measure, and of what is not used
-DEPTH_UNKNOWN = 1.0  # 1-sigma at birth, as a fraction
-MAX_SIDE_OUTLIER = 0.45  # prior probability of one side
-MIN_WEIGHT = 1e-9  # of a filter: one that was ruled out may come back
+UNKNOWN_VARIANCE = 1e6  # of an unmeasured size, and of unused measurements
+INITIAL_POSITION_SIGMA_REL = 1.0  # of the depth
+MAX_SIDE_OUTLIER_PROBABILITY = 0.45  # prior of one side
+MIN_WEIGHT = 1e-9  # of a filter, so that it can recover
 
 
 @dataclass(frozen=True)
 class LearnedSize:
-    """Alternative measurements of log h, (N, K), each with the probability `weight` and its variance.
+    """Alternative measurements of log h (N, K), each with its probability `weight` and its variance.
 
-    `speed_mps` (N,) is the root mean square of the speeds in all modes, each with its probability.
-    `side_outlier` (N, 2): the probabilities that the left side of a vehicle's box is an outlier, and the right.
+    `speed_mps` (N,) is the RMS speed over the modes. `side_outlier` (N, 2) are the probabilities that the left side of
+    the box is an outlier, and the right.
     """
 
     weight: Floats
@@ -77,13 +76,12 @@ class LearnedSize:
 
 
 class Parallax:
-    """predict() once a frame, then learn_sizes() from its boxes.
+    """Calls per frame: predict(), then learn_sizes().
 
-    State, of each vehicle and each mode: x, y (m), vx, vy (m/s) in the odometry's world, log height (of metres),
-    log of the outline's width as a factor, tilt (rad) and kerb (m) of its road, and the mode's probability.
-    Measurements: of each box the logs of its height, its width and its bottom as slopes, and the bearing of its centre
-    (see the module). `placing.Placing` hands the learned sizes to `ground_size_filter.GroundSizeFilter`; the tracker
-    and the smoother read `standing`.
+    State of each vehicle and mode: x, y (m), vx, vy (m/s) in the odometry world, log height (m), log factor on the
+    width of the outline, tilt (rad) and offset (m) of its ground, and the probability of the mode. Measurements of each
+    box: logs of height, width and bottom slope, and bearing of the centre. Readers: `placing.Placing`, which passes the
+    sizes to `ground_size_filter.GroundSizeFilter`; tracker and smoother for `stationary_probability`.
     """
 
     def __init__(self, config: ParallaxConfig) -> None:
@@ -92,7 +90,7 @@ class Parallax:
         self._x = np.zeros((0, FILTERS, len(STATES)))
         self._P = np.zeros((0, FILTERS, len(STATES), len(STATES)))
         self._weight = np.zeros((0, len(MODES)))
-        self._prior = np.zeros((0, 2))  # log h and its variance, as the class has it
+        self._prior = np.zeros((0, 2))  # log h of the class and its variance
         self._unseen_s = np.zeros(0)
         self._yaw_rad = np.zeros(0)  # in world
         self._on_road = np.zeros(0, np.bool_)
@@ -101,12 +99,12 @@ class Parallax:
     def __len__(self) -> int:
         return len(self._x)
 
-    def standing(self, row: int) -> float:
-        """The probability that a vehicle stands."""
+    def stationary_probability(self, row: int) -> float:
+        """Probability that a vehicle is stationary."""
         weight = self._weight[row]
-        return float(weight[STANDING] + weight[UNUSUAL] + weight[ANOTHER])
+        return float(weight[STATIONARY] + weight[UNUSUAL_SIZE] + weight[NEIGHBOUR])
 
-    def begin(
+    def add_vehicle(
         self,
         centre_m: Floats,
         yaw_rad: float,
@@ -114,26 +112,26 @@ class Parallax:
         log_height: float,
         sigmas: tuple[float, float],
     ) -> None:
-        """A vehicle seen for the first time, at about `centre_m` (2,) and `yaw_rad` in ego, corrected by its first box.
+        """Adds a vehicle at about `centre_m` (2,) and `yaw_rad` in ego, before the update by its first box.
 
-        `log_height` is that of its class, `sigmas` are those of log h and log w in it.
+        `log_height` is that of its class, `sigmas` are those of log h and log w.
         """
         config = self.config
         x = np.zeros((1, FILTERS, len(STATES)))
         x[..., :2] = T_world_ego @ centre_m
         x[..., HEIGHT] = log_height
         P = np.zeros((1, FILTERS, len(STATES), len(STATES)))
-        P[..., :2, :2] = np.eye(2) * (DEPTH_UNKNOWN * float(centre_m[0])) ** 2
+        P[..., :2, :2] = np.eye(2) * (INITIAL_POSITION_SIGMA_REL * float(centre_m[0])) ** 2
         heading_rad = np.array([T_world_ego.yaw_rad + yaw_rad])
         on_road = abs(float(centre_m[1])) < config.road_half_width_m
         for moving, cov in birth_velocity_cov(config, heading_rad, on_road).items():
             P[:, moving, VX:HEIGHT, VX:HEIGHT] = cov
         P[..., [HEIGHT, WIDTH], [HEIGHT, WIDTH]] = np.square(sigmas)
-        P[:, [UNUSUAL, WITHOUT_GROUND[1]], HEIGHT, HEIGHT] = config.sigma_unusual_rel**2
+        P[:, [UNUSUAL_SIZE, WITHOUT_GROUND[1]], HEIGHT, HEIGHT] = config.sigma_unusual_rel**2
         P[..., TILT, TILT] = config.sigma_tilt_rad**2
         aside_m = float(centre_m[1])
         below_m = config.sigma_kerb_m, config.sigma_crown_rad * aside_m, config.sigma_bank_per_m * aside_m**2
-        P[..., KERB, KERB] = math.hypot(*below_m) ** 2
+        P[..., OFFSET, OFFSET] = math.hypot(*below_m) ** 2
         self._x, self._P = np.concatenate([self._x, x]), np.concatenate([self._P, P])
         self._weight = np.concatenate([self._weight, self._prior_weight[None]])
         self._prior = np.concatenate([self._prior, [[log_height, sigmas[0] ** 2]]])
@@ -143,35 +141,35 @@ class Parallax:
         self._unseen_s = np.append(self._unseen_s, max(config.box_memory_s, config.view_memory_s))
 
     def predict(self, dt_s: float, T_world_ego: SE2, ego_cov: Floats | None) -> None:
-        """To the next frame, whose ego pose the odometry gives with `ego_cov` (3, 3) of the last step's tangent."""
+        """Predicts to the next frame; `ego_cov` (3, 3) is the covariance of the ego's step in its tangent space."""
         self._unseen_s += dt_s
         self._side_outlier *= math.exp(-dt_s / self.config.side_outlier_memory_s)
         if not len(self._x) or dt_s <= 0.0:
             return
         config = self.config
-        leap = self._leaps(T_world_ego)
-        self._weight, self._x, self._P = mix(config, dt_s, self._weight, self._x, self._P, leap)
-        keep = math.exp(-dt_s / config.tilt_memory_s)
-        self._x[..., TILT] *= keep
-        self._P[..., TILT, :] *= keep
-        self._P[..., TILT] *= keep
-        self._P[..., TILT, TILT] += (1.0 - keep**2) * config.sigma_tilt_rad**2
+        neighbour_cov = self._neighbour_covs(T_world_ego)
+        self._weight, self._x, self._P = mix(config, dt_s, self._weight, self._x, self._P, neighbour_cov)
+        decay = math.exp(-dt_s / config.tilt_memory_s)
+        self._x[..., TILT] *= decay
+        self._P[..., TILT, :] *= decay
+        self._P[..., TILT] *= decay
+        self._P[..., TILT, TILT] += (1.0 - decay**2) * config.sigma_tilt_rad**2
         F = np.eye(len(STATES))
         F[X, VX] = F[Y, VY] = dt_s
-        self._x[:, MOVING] = self._x[:, MOVING] @ F.T
-        self._P[:, MOVING] = F @ self._P[:, MOVING] @ F.T
-        self._P[:, MOVING, : VY + 1, : VY + 1] += process_noise(config, dt_s, self._yaw_rad, self._on_road)
-        if ego_cov is not None:  # an error of the ego's step moves the vehicle against it
+        self._x[:, MOVING_MODES] = self._x[:, MOVING_MODES] @ F.T
+        self._P[:, MOVING_MODES] = F @ self._P[:, MOVING_MODES] @ F.T
+        self._P[:, MOVING_MODES, : VY + 1, : VY + 1] += process_noise(config, dt_s, self._yaw_rad, self._on_road)
+        if ego_cov is not None:  # an error of the ego step moves the vehicle in ego
             at = self._x[..., :2] - [T_world_ego.x_m, T_world_ego.y_m]
             J = np.zeros((*at.shape[:2], 2, 3))
             J[..., :2, :2] = T_world_ego.rotation()
             J[..., 0, 2], J[..., 1, 2] = -at[..., 1], at[..., 0]
             self._P[..., :2, :2] += J @ ego_cov @ J.swapaxes(-1, -2)
 
-    def _leaps(self, T_world_ego: SE2) -> Floats:
-        """(N, 8, 8) the covariance of the state of a vehicle's neighbour, in a row of parked ones, about its own."""
+    def _neighbour_covs(self, T_world_ego: SE2) -> Floats:
+        """(N, 8, 8) covariance of a parked neighbour's state about a vehicle's own."""
         config = self.config
-        along = config.sigma_another_rel * (self._x[:, STANDING, :VX] - [T_world_ego.x_m, T_world_ego.y_m])
+        along = config.sigma_another_rel * (self._x[:, STATIONARY, :VX] - [T_world_ego.x_m, T_world_ego.y_m])
         out = np.zeros((len(along), len(STATES), len(STATES)))
         out[:, :VX, :VX] = along[:, :, None] * along[:, None, :] + config.sigma_another_m**2 * np.eye(2)
         out[:, [HEIGHT, WIDTH], [HEIGHT, WIDTH]] = config.sigma_another_size_rel**2
@@ -180,7 +178,7 @@ class Parallax:
     def learn_sizes(
         self, rows: Sequence[int], boxes: ParallaxMeasurements, T_world_ego: SE2, height_m: float
     ) -> LearnedSize:
-        """Each vehicle's size by its motion in the image, for these rows; `height_m` is the camera's."""
+        """Updates these rows by their boxes and returns the sizes by parallax; `height_m` is the camera height."""
         if not rows:
             nothing = np.zeros((0, len(WITHOUT_GROUND) + 1))
             return LearnedSize(nothing, nothing, nothing, np.zeros(0), np.zeros((0, 2)))
@@ -200,7 +198,7 @@ class Parallax:
         noise = self._noise(boxes, innovation, S, of_box, of_face * of_view)
         S = S + noise
         shift = side_outlier_shift(boxes, innovation, config.sigma_side_outlier_rel * np.sqrt(of_box))
-        share = np.minimum(config.side_outlier + self._side_outlier[rows], MAX_SIDE_OUTLIER).T
+        share = np.minimum(config.side_outlier + self._side_outlier[rows], MAX_SIDE_OUTLIER_PROBABILITY).T
         after = update_with_side_outliers(P, PJt, S, innovation, shift, share)
         self._x[rows] = x + after.step
         self._P[rows] = after.cov
@@ -219,55 +217,55 @@ class Parallax:
     def _noise(
         self, boxes: ParallaxMeasurements, innovation: Floats, S: Floats, of_box: Floats, face_var: Floats
     ) -> Floats:
-        """(N, FILTERS, 4, 4): measurement noise, raised for outliers; S is of the predicted measurements.
+        """(N, FILTERS, 4, 4) measurement noise, raised for outliers; S is of the predicted measurements.
 
-        Errors that last get so much more noise that they count once over their memory: `of_box` (N,) is the factor of a
-        box's variance, `face_var` (N,) the variance of the nearest face with its own.
+        Noise is inflated so that correlated errors count once per correlation time: `of_box` (N,) is the factor on a
+        box's variance, `face_var` (N,) the inflated variance of the nearest face.
         """
         variance = np.empty((len(of_box), FILTERS, len(CUES)))
         variance[..., :GROUND] = (np.square(boxes.sigma) * of_box[:, None])[:, None]
         variance[..., [BY_HEIGHT, BY_WIDTH]] += face_var[:, None, None]
         sigma_rel = boxes.sigma_bottom / np.maximum(boxes.bottom, MIN_SLOPE)
         variance[..., GROUND] = (np.square(sigma_rel) * of_box)[:, None]
-        variance[:, WITHOUT_GROUND, GROUND] = UNKNOWN
+        variance[:, WITHOUT_GROUND, GROUND] = UNKNOWN_VARIANCE
         noise = variance[..., None] * np.eye(len(CUES))
         nis = _squared_mahalanobis(innovation, S + noise).min(axis=1)
         noise *= np.maximum(1.0, nis / self.config.gate_sigma**2)[:, None, None, None]
         return noise
 
     def keep_rows(self, rows: Sequence[int]) -> None:
-        """Forget the vehicles of all other rows."""
+        """Removes the vehicles of all other rows."""
         for name in ("_x", "_P", "_weight", "_prior", "_unseen_s", "_yaw_rad", "_on_road", "_side_outlier"):
             setattr(self, name, getattr(self, name)[rows])
 
     def _size_measurements(
         self, rows: Sequence[int], lasting: Floats, in_path: NDArray[np.bool_], side_outlier: Floats
     ) -> LearnedSize:
-        """Of each stationary filter log h without the class's prior; of the moving ones, which brake and turn, none.
+        """Log h of each stationary filter without the class's prior; none of the moving filters.
 
-        `lasting` (N,) is a variance that frames don't reduce. Vehicles `in_path` (N,) are left out here alone: once the
-        ego passes beside one, the filters have all that was seen of it.
+        `lasting` (N,) is a variance that does not average out. Vehicles `in_path` (N,) are excluded in this output
+        only.
         """
         mean, var = self._x[rows][:, WITHOUT_GROUND, HEIGHT], self._P[rows][:, WITHOUT_GROUND, HEIGHT, HEIGHT]
         prior, prior_var = self._prior[rows].T[..., None]
         information = 1.0 / var - 1.0 / prior_var
-        informed = information > 1.0 / UNKNOWN
+        informed = information > 1.0 / UNKNOWN_VARIANCE
         informed[in_path] = False
-        information = np.where(informed, information, 1.0 / UNKNOWN)
+        information = np.where(informed, information, 1.0 / UNKNOWN_VARIANCE)
         log_height = np.where(informed, (mean / var - prior / prior_var) / information, prior)
         variance = 1.0 / information + lasting[:, None]
         weight = self._weight[rows]
-        square = np.square(self._x[rows][:, MOVING, VX:HEIGHT]).sum(axis=-1)
+        square = np.square(self._x[rows][:, MOVING_MODES, VX:HEIGHT]).sum(axis=-1)
         return LearnedSize(
-            np.column_stack([weight[:, STATIONARY], 1.0 - weight[:, STATIONARY].sum(axis=1)]),
+            np.column_stack([weight[:, STATIONARY_MODES], 1.0 - weight[:, STATIONARY_MODES].sum(axis=1)]),
             np.column_stack([log_height, prior]),
-            np.column_stack([variance, np.full(len(rows), UNKNOWN)]),
-            np.sqrt((weight[:, MOVING] * square).sum(axis=1)),
+            np.column_stack([variance, np.full(len(rows), UNKNOWN_VARIANCE)]),
+            np.sqrt((weight[:, MOVING_MODES] * square).sum(axis=1)),
             side_outlier,
         )
 
 
 def _squared_mahalanobis(gap: Floats, S: Floats) -> Floats:
-    """(...): Mahalanobis distances squared of gaps (..., 4) with covariances (..., 4, 4)."""
+    """Squared Mahalanobis distances (...) of gaps (..., 4) with covariances (..., 4, 4)."""
     out: Floats = np.einsum("...a,...a->...", gap, np.linalg.solve(S, gap[..., None])[..., 0])
     return out

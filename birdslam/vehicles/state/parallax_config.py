@@ -1,4 +1,4 @@
-"""Priors of `parallax.Parallax`: how vehicles move and stop, and how long the errors of boxes last."""
+"""Parameters of `parallax.Parallax`: motion modes of vehicles, and correlation of the errors of boxes."""
 
 from __future__ import annotations
 
@@ -8,41 +8,41 @@ import msgspec
 
 
 class ParallaxConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How vehicles move and stop, and how long the errors of a detector last; docs/constants.md has the data."""
+    """Motion modes of vehicles and errors of boxes; docs/constants.md lists the tuned ones."""
 
-    standing: float = 0.3  # of the vehicles, when first seen; those that drive are the rest
-    unusual: float = 0.03  # that stand and are of no usual size
-    creeping: float = 0.3  # of the vehicles, when first seen: slowly, along their heading
-    crossing: float = 0.05  # of the vehicles, when first seen: they drive in any direction
-    sigma_unusual_rel: float = 0.3  # of their height
+    standing: float = 0.3  # initial probability: stationary
+    unusual: float = 0.03  # initial probability: stationary, with an unusual size
+    creeping: float = 0.3  # initial probability: slow, along the heading
+    crossing: float = 0.05  # initial probability: in any direction
+    sigma_unusual_rel: float = 0.3  # of the height
     sigma_creep_mps: float = 2.0  # 1-sigma of a creeping vehicle's velocity
     sigma_drive_mps: float = 10.0  # 1-sigma of a driving vehicle's velocity
-    road_half_width_m: float = 10.0  # what moves farther aside than that may do so in any direction
-    sigma_across_rel: float = 0.1  # of it across the vehicle's heading, as a fraction
-    sigma_across_mps: float = 0.3  # and beside it
-    stands_for_s: float = 60.0  # on average, until it starts to creep
-    creeps_for_s: float = 10.0  # until it stops, or drives
-    drives_for_s: float = 20.0  # until it creeps
-    change_mps: float = 2.0  # 1-sigma by which the velocity of a vehicle that moves changes within a second
-    change_across_mps: float = 0.5  # the same across its heading
-    outline_drift_rel: float = 0.03  # of the outline's width, in a second: the yaw is not known as well
-    box_memory_s: float = 0.5  # for so long a box has the same error: this time counts as one box
-    view_memory_s: float = 1.5  # the same of the face that its edges lie at
-    sigma_scale_rel: float = 0.02  # of the odometry's metres
-    sigma_tilt_rad: float = 0.004  # of the road at a vehicle against the ego's
-    tilt_memory_s: float = 5.0  # how long that lasts
-    sigma_kerb_m: float = 0.06  # how far the road under a vehicle in the ego's lane lies off the ego's plane
-    sigma_crown_rad: float = 0.007  # and the more the farther it stands to the side
-    sigma_bank_per_m: float = 0.001  # and more, by the square of that: what stands far aside is on another road
-    sigma_face_m: float = 1.0  # edges of a box lie not all at its nearest face, and on others as it turns
-    path_half_width_m: float = 1.75  # of the ego's path, half a lane: there growth is the closing gap's, of any size
-    # Of the left sides of boxes, and of the right: hidden, or a neighbour's (side_outliers.py)
+    road_half_width_m: float = 10.0  # lateral distance beyond which vehicles move in any direction
+    sigma_across_rel: float = 0.1  # 1-sigma of the lateral velocity, of that along the heading
+    sigma_across_mps: float = 0.3  # and a constant part
+    stands_for_s: float = 60.0  # mean duration
+    creeps_for_s: float = 10.0  # mean duration
+    drives_for_s: float = 20.0  # mean duration
+    change_mps: float = 2.0  # 1-sigma of the change of velocity within a second
+    change_across_mps: float = 0.5  # the same across the heading
+    outline_drift_rel: float = 0.03  # of the width of the outline, within a second
+    box_memory_s: float = 0.5  # correlation time of the errors of a box
+    view_memory_s: float = 1.5  # correlation time of the depth of the faces at its edges
+    sigma_scale_rel: float = 0.02  # of the odometry's scale
+    sigma_tilt_rad: float = 0.004  # of the road at a vehicle relative to the ego
+    tilt_memory_s: float = 5.0  # correlation time of it
+    sigma_kerb_m: float = 0.06  # ground offset under a vehicle from the ego's plane
+    sigma_crown_rad: float = 0.007  # and its growth with the lateral distance
+    sigma_bank_per_m: float = 0.001  # and with the square of it
+    sigma_face_m: float = 1.0  # of the depth of the faces at a box's edges
+    path_half_width_m: float = 1.75  # of the ego's path, in which growth is ambiguous
+    # Probability that the left side of a box is an outlier, and the right (side_outliers.py)
     side_outlier: Annotated[float, msgspec.Meta(ge=0.0, le=0.3)] = 0.03
-    side_outlier_memory_s: Annotated[float, msgspec.Meta(gt=0.0)] = 0.15  # how long one lasts
-    sigma_side_outlier_rel: float = 0.3  # of the box's width
-    gate_sigma: float = 3.0  # past it of all filters a measurement is an outlier: its noise is raised
-    own_for_s: float = 5.0  # on average, until boxes are those of a neighbour of the track's vehicle
-    another_for_s: float = 0.5  # until that neighbour is the track's vehicle
-    sigma_another_rel: float = 0.15  # how far off it stands along the line of sight: a row of parked vehicles
+    side_outlier_memory_s: Annotated[float, msgspec.Meta(gt=0.0)] = 0.15  # correlation time
+    sigma_side_outlier_rel: float = 0.3  # of the width of the box
+    gate_sigma: float = 3.0  # beyond it in all filters, the noise of a measurement is raised
+    own_for_s: float = 5.0  # mean time until the boxes are those of a neighbour
+    another_for_s: float = 0.5  # mean time until that neighbour is the track's vehicle
+    sigma_another_rel: float = 0.15  # of its position along the line of sight
     sigma_another_m: float = 1.0  # and across it
-    sigma_another_size_rel: float = 0.1  # how much its size differs
+    sigma_another_size_rel: float = 0.1  # of its size

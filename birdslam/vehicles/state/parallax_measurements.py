@@ -1,7 +1,7 @@
-"""The measurements of a box in `parallax.Parallax`, from its slopes, and what a state expects of them.
+"""Measurement model of a box in `parallax.Parallax`.
 
-z is the depth of the nearest face, r on to the roof's far edge, y/x the centre's bearing, H the camera's height, d the
-kerb, by which the road at the vehicle lies lower than the ego's plane, and tilt by how much it is tilted against it:
+z is the depth of the nearest face, r the distance on to the roof's far edge, y/x the bearing of the centre, H the
+camera height, d the offset of the ground below the ego plane, tilt its slope relative to it:
 
     log(bottom - top - (H - h) r / (z (z + r))) = log h - log z        y / x
     log(left - right) = log w + log(class's outline) - log z           log(bottom) = log((H + d) / z - tilt)    (Eq. 1)
@@ -23,26 +23,26 @@ from birdslam.vehicles.placement.localisation import MIN_DISTANCE_M, Observation
 
 Floats = NDArray[np.float64]
 
-STATES = X, Y, VX, VY, HEIGHT, WIDTH, TILT, KERB = range(8)  # see parallax.py
-CUES = BY_HEIGHT, BY_WIDTH, BEARING, GROUND = range(4)  # measurements of each box, in this order
-MIN_SLOPE = 0.01  # of a box's bottom: it is taken to lie no higher
+STATES = X, Y, VX, VY, HEIGHT, WIDTH, TILT, OFFSET = range(8)  # see parallax.py
+CUES = BY_HEIGHT, BY_WIDTH, BEARING, GROUND = range(4)  # measurements per box, in this order
+MIN_SLOPE = 0.01  # minimum of a box's bottom
 
 
 @dataclass(frozen=True)
 class ParallaxMeasurements:
-    """One frame's boxes (N,): see the module; `reach_m` from the nearest face to the centre."""
+    """One frame's boxes (N,), see the module; `reach_m` is the distance from the nearest face to the centre."""
 
     log_height: Floats
-    log_width: Floats  # less the class's outline
+    log_width: Floats  # minus the log of the class's outline
     bearing: Floats  # of the centre
     sigma: Floats  # (N, 3)
-    depth_m: Floats  # about
+    depth_m: Floats  # approximate
     bottom: Floats  # slope
     sigma_bottom: Floats
     reach_m: Floats
-    turned_rad: Floats  # by how much the line of sight turned since last seen, so that another side is seen
-    yaw_rad: Floats  # of the vehicle in ego, as known
-    tan_width: Floats  # of the box, at a depth of 1
+    turned_rad: Floats  # rotation of the line of sight since the last observation
+    yaw_rad: Floats  # estimated yaw in ego
+    tan_width: Floats  # at a depth of 1
 
 
 def measure_boxes(
@@ -54,10 +54,10 @@ def measure_boxes(
     roof_m2: Floats,
     vertical_per_m: float = 0.0,
 ) -> ParallaxMeasurements:
-    """Of observations (N,), with each centre (N, 2) in ego at about its depth, and extents (N, 2) as of `extent_m`.
+    """Measurements of observations (N,), with approximate centres (N, 2) in ego and extents (N, 2) of `extent_m`.
 
-    `roof_m2` (N,): how far the camera stands above the roof times how far the roof reaches along the line of sight.
-    `vertical_per_m`: the road's vertical curvature; bottoms count from the plane's horizon.
+    `roof_m2` (N,) is the height of the camera above the roof times the reach of the roof along the line of sight.
+    `vertical_per_m` is the road's vertical curvature; bottoms are relative to the plane's horizon.
     """
     depth = np.maximum(centres_m[:, 0] - extents_m[:, 0] / 2.0, MIN_DISTANCE_M)
     over_roof = roof_m2 / (depth * (depth + extents_m[:, 0]))
@@ -85,12 +85,12 @@ def measure_boxes(
 
 
 def linearised(x: Floats, boxes: ParallaxMeasurements, T_world_ego: SE2, height_m: float) -> tuple[Floats, Floats]:
-    """Innovations (N, K, 4) and their derivatives (N, K, 4, 8) by the states x (N, K, 8); `height_m`: the camera's."""
+    """Innovations (N, K, 4) and Jacobians (N, K, 4, 8) at the states x (N, K, 8); `height_m` is the camera height."""
     R_ego_world = T_world_ego.rotation().T
     at = (x[..., :2] - [T_world_ego.x_m, T_world_ego.y_m]) @ R_ego_world.T
     depth = np.maximum(at[..., 0] - boxes.reach_m[:, None], MIN_DISTANCE_M)
     ahead = np.maximum(at[..., 0], MIN_DISTANCE_M)
-    level = bev.road_slope(depth, height_m + x[..., KERB])  # Eq. 1
+    level = bev.road_slope(depth, height_m + x[..., OFFSET])  # Eq. 1
     slope = np.maximum(level - x[..., TILT], MIN_SLOPE)
     J = np.zeros((*x.shape[:2], len(CUES), len(STATES)))
     J[..., BY_HEIGHT, HEIGHT] = J[..., BY_WIDTH, WIDTH] = 1.0
@@ -99,7 +99,7 @@ def linearised(x: Floats, boxes: ParallaxMeasurements, T_world_ego: SE2, height_
     J[..., BEARING, :2] = (R_ego_world[1] - (at[..., 1] / ahead)[..., None] * R_ego_world[0]) / ahead[..., None]
     J[..., GROUND, :2] = by_place * (level / slope)[..., None]
     J[..., GROUND, TILT] = -1.0 / slope
-    J[..., GROUND, KERB] = 1.0 / (depth * slope)
+    J[..., GROUND, OFFSET] = 1.0 / (depth * slope)
     log_bottom = np.log(np.maximum(boxes.bottom, MIN_SLOPE))
     seen = np.stack([boxes.log_height, boxes.log_width, boxes.bearing, log_bottom], axis=-1)[:, None]
     log_z = np.log(depth)
@@ -108,11 +108,11 @@ def linearised(x: Floats, boxes: ParallaxMeasurements, T_world_ego: SE2, height_
 
 
 def side_outlier_shift(boxes: ParallaxMeasurements, innovation: Floats, sigma_rel: Floats) -> Floats:
-    """(2, N, K, 4): by how much an outlier of the left, the right side moves the measurements, 1-sigma.
+    """(2, N, K, 4) 1-sigma effect of an outlier of the left, the right side on the measurements.
 
-    `innovation` (N, K, 4) is that of the boxes, `sigma_rel` (N,) the outlier's as a share of the width. A box that lost
-    the share h of its width w has it in log less by -log(1 - h), and its centre moved by h w / 2: half of that times
-    the geometric mean of both widths, seen and expected, which is right to h^3 / 24.
+    `innovation` (N, K, 4) is that of the boxes, `sigma_rel` (N,) the outlier's, of the width. A box that lost the
+    fraction h of its width w changes by log(1 - h), and its centre by h w / 2: half of that times the geometric mean of
+    measured and expected width, up to h^3 / 24.
     """
     shift = np.zeros((2, *innovation.shape))
     shift[..., BY_WIDTH] = sigma_rel[:, None]

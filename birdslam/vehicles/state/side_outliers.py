@@ -1,9 +1,8 @@
-"""A Kalman update by boxes, any of which may have one side that is an outlier.
+"""Kalman update by boxes, of which one side may be an outlier.
 
-Detectors end a box where a tree or a wall hides the rest of a vehicle, or draw it around two. So each box comes of one
-of three cases: no side is an outlier, the left, or the right. An outlier moves width and bearing together, so that its
-noise is of rank one, u u'; by Sherman and Morrison (S + u u')^-1 = S^-1 - S^-1 u u' S^-1 / (1 + u' S^-1 u), and
-det(S + u u') = det(S) (1 + u' S^-1 u). The mixture of the three becomes one normal distribution again.
+Each box is one of three cases: no outlier, left, or right. An outlier has rank-one noise u u' on width and bearing; by
+Sherman-Morrison (S + u u')^-1 = S^-1 - S^-1 u u' S^-1 / (1 + u' S^-1 u), det(S + u u') = det(S) (1 + u' S^-1 u). The
+posterior mixture is approximated by one normal distribution.
 """
 
 from __future__ import annotations
@@ -20,9 +19,10 @@ _MIN_PROBABILITY = 1e-300
 
 @dataclass(frozen=True)
 class SideUpdate:
-    """Of N boxes and F filters with D states each: `step` (N, F, D) to the mean, `cov` (N, F, D, D) after it.
+    """For N boxes and F filters with D states: `step` (N, F, D) of the mean, `cov` (N, F, D, D) after the update.
 
-    `log_likelihood` (N, F) less a constant; `outlier` (2, N, F): the probabilities that the left, the right is one.
+    `log_likelihood` (N, F) without a constant; `outlier` (2, N, F): probabilities that the left, the right is an
+    outlier.
     """
 
     step: Floats
@@ -34,10 +34,10 @@ class SideUpdate:
 def update_with_side_outliers(
     P: Floats, PJt: Floats, S: Floats, innovation: Floats, shift: Floats, share: Floats
 ) -> SideUpdate:
-    """From P (N, F, D, D), P J' (N, F, D, M), and the innovations (N, F, M) of boxes without outliers with their cov S.
+    """Updates from P (N, F, D, D), P J' (N, F, D, M) and innovations (N, F, M) with their covariance S.
 
-    `shift` (2, N, F, M): by how much an outlier of the left, the right side moves the measurements, 1-sigma.
-    `share` (2, N): the probabilities beforehand that the left, the right is an outlier.
+    `shift` (2, N, F, M) is the 1-sigma effect of an outlier of the left, the right side on the measurements. `share`
+    (2, N) is its prior probability.
     """
     information = np.linalg.inv(S)
     weighted = (information @ innovation[..., None])[..., 0]
@@ -56,7 +56,7 @@ def update_with_side_outliers(
 
     gain_shift = np.moveaxis((PJt @ of_shift[..., None])[..., 0], 0, -1)  # (N, F, D, 2)
     outlier_last, pulled = np.moveaxis(outlier, 0, -1), np.moveaxis(along / grown, 0, -1)
-    # Each case steps by -pulled gain_off beside the step without outliers, and is less certain by gain_off^2 / grown
+    # Relative to the update without outliers, each case steps by -pulled gain_shift, with cov + gain_shift^2 / grown
     step = -(gain_shift @ (outlier_last * pulled)[..., None])[..., 0]
     spread = outlier_last * (np.square(pulled) + 1.0 / np.moveaxis(grown, 0, -1))
     cov = P - PJt @ information @ PJt.swapaxes(-1, -2)

@@ -1,10 +1,10 @@
-"""The prior of heights: a class's mean, what a drive's vehicles have in common, and Student's t about both.
+"""Prior of heights: mean of the class, a common offset of the drive, and a Student's t per vehicle.
 
     log h = log h_class + common + own,   own ~ t(dof, scale)
 
-One car in thirty is over 15 % taller than its class: more than a normal distribution has. A t is a normal distribution
-of variance scale^2 / w, with the mean weight w = (dof - 1) / (dof + E[own^2] / scale^2) once `own` is known. As a
-height is learned, its prior's weight is replaced: a change of information of rank one (Sherman, Morrison).
+The tails of a normal distribution are too thin. The t is treated as a normal distribution of variance scale^2 / w with
+the mean weight w = (dof - 1) / (dof + E[own^2] / scale^2). The weight is updated as the height is learned, by a rank-
+one change of the information (Sherman-Morrison).
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-MIN_VARIANCE = 1e-12  # of a height that its class knows exactly
-_MIN_CHANGE = 0.02  # of a weight: a smaller one is left for later
+MIN_VARIANCE = 1e-12  # of a height
+_MIN_CHANGE = 0.02  # of a weight, for an update
 
 
 class SizePrior:
-    """begin() with each vehicle, then reweigh() after its boxes.
+    """Calls: add_vehicle() per vehicle, then reweigh() after its boxes.
 
-    State, of each vehicle: the log of its class's height (m), the squared scale of its t and its weight.
+    State of each vehicle: log of the class's height (m), squared scale of its t, and its weight.
     """
 
     def __init__(self, sigma_common: float, dof: float) -> None:
@@ -33,8 +33,8 @@ class SizePrior:
         self._scale2 = np.zeros(0)
         self._weight = np.zeros(0)
 
-    def begin(self, height_m: float, sigma_height: float) -> tuple[float, float]:
-        """Of a vehicle in the next row: the share of `common` that it has, and the variance of its own part."""
+    def add_vehicle(self, height_m: float, sigma_height: float) -> tuple[float, float]:
+        """Adds a vehicle in the next row; returns its factor on `common`, and the variance of its own part."""
         variance = sigma_height**2 - self.sigma_common**2
         shares = variance > 0.0
         if not shares:
@@ -53,7 +53,7 @@ class SizePrior:
         height_m: float,
         sigma_height: float,
     ) -> tuple[Floats, Floats]:
-        """State and covariance with another prior of a vehicle's height; `at` is where log h and `common` stand."""
+        """Replaces the prior of a vehicle in state and covariance; `at` is the index of log h and of `common`."""
         variance = max(sigma_height**2 - self.sigma_common**2, MIN_VARIANCE)
         weight = 1.0 - 2.0 / self.dof
         priors = (
@@ -64,24 +64,24 @@ class SizePrior:
                 float(self._scale2[row]),
             ),
         )
-        for mean, share, scale2 in priors:  # the new one first: information is never negative
+        for mean, share, scale2 in priors:  # the new one first, so that the information stays positive
             x, P = _informed(x, P, at, mean, share / scale2)
         self.log_height[row], self._weight[row], self._scale2[row] = priors[0]
         return x, P
 
     def keep_rows(self, rows: Sequence[int]) -> None:
-        """Forget the vehicles of all other rows."""
+        """Removes the vehicles of all other rows."""
         for name in ("log_height", "_scale2", "_weight"):
             setattr(self, name, getattr(self, name)[rows])
 
     def without_vehicles(self) -> SizePrior:
-        """One for the same class table."""
+        """An empty prior with the same parameters."""
         return SizePrior(self.sigma_common, self.dof)
 
     def reweigh(
         self, rows: Sequence[int], x: Floats, P: Floats, at: NDArray[np.intp], common: int
     ) -> tuple[Floats, Floats]:
-        """State (M,) and covariance (M, M) by new weights; log h is at `at` (N,), what they share at `common`."""
+        """Updates the weights in state (M,) and covariance (M, M); log h is at `at` (N,), the offset at `common`."""
         if not math.isfinite(self.dof):
             return x, P
         own = x[at] - x[common] - self.log_height[rows]

@@ -1,4 +1,4 @@
-"""The yaw of each vehicle: a filter of one angle, corrected by the direction of its motion and by its body's yaw."""
+"""Yaw filter of each vehicle, corrected by the direction of motion and by the yaw of its body."""
 
 from __future__ import annotations
 
@@ -14,17 +14,16 @@ from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
 from birdslam.vehicles.state.yaw_by_outline import YawByOutline
 from birdslam.vehicles.track import Track, TrackingConfig
 
-MIN_TURN_RAD = 0.02  # a smaller turn is none, so that yaws that are not known don't quiver
-MOTION_LOGIT = 6.0  # log odds of the front of a vehicle that was seen to move
+MIN_TURN_RAD = 0.02  # smaller turns are ignored, against jitter
+MOTION_FRONT_LOGIT = 6.0  # log odds of the front of a moving vehicle
 
 
 class YawFilter:
     """A scalar Kalman filter for each vehicle.
 
-    State: the yaw in the odometry's world and its 1-sigma (rad), and the log odds that it points to the front; all are
-    fields of `Track`. Measurements: the direction of the track's velocity (rad), once the vehicle surely moves, and the
-    yaw (rad) that a network sees in its body. Read by `vehicle_edges` (the yaw of CV and VV edges), by
-    `placing.Placing` and by the next frames' outlines in `ground_size_filter.GroundSizeFilter`.
+    State: yaw in the odometry world and its 1-sigma (rad), and log odds of the front; all are fields of `Track`.
+    Measurements: direction of a significant velocity (rad), and yaw (rad) of the body by a network. Readers:
+    `vehicle_edges`, `placing.Placing`, and the outlines in `ground_size_filter.GroundSizeFilter`.
     """
 
     def __init__(self, config: TrackingConfig, localisation: LocalisationConfig, ground_size: GroundSizeFilter) -> None:
@@ -35,14 +34,14 @@ class YawFilter:
         self._ego_speed_mps = 0.0
 
     def predict(self, dt_s: float, step: SE2) -> None:
-        """To the next frame, `dt_s` later, to which the ego made `step`."""
+        """Predicts to the next frame, `dt_s` later, after the ego motion `step`."""
         if dt_s > 0.0:
             self._ego_speed_mps = math.hypot(step.x_m, step.y_m) / dt_s
         self._dt_s = dt_s
 
     def correct_by_motion(self, row: int, track: Track) -> None:
-        """A vehicle that surely moves heads where it moves; one that may stand keeps its yaw."""
-        if track.stands or track.observation.cut_side:
+        """Corrects the yaw by the direction of a significant motion."""
+        if track.is_stationary or track.observation.is_cut_at_side:
             return
         vx, vy = track.state[2:].tolist()
         speed = math.hypot(vx, vy)
@@ -52,19 +51,19 @@ class YawFilter:
         if speed < slowest or not self._has_moved(track):
             return
         turn = wrap(math.atan2(vy, vx) - track.yaw_rad)
-        if track.yaw_known and abs(turn) > math.pi / 2.0:  # its rear was mistaken for its front
+        if track.is_yaw_known and abs(turn) > math.pi / 2.0:  # front and rear were swapped
             track.yaw_rad, turn = wrap(track.yaw_rad + math.pi), wrap(turn - math.pi)
-        track.front_logit = MOTION_LOGIT
+        track.front_logit = MOTION_FRONT_LOGIT
         self._correct(row, track, turn, (config.direction_inflation * sigma / speed) ** 2)
 
     def correct_by_body(self, row: int, track: Track, by_depth: DepthPlace | None) -> None:
-        """Towards the yaw that a network saw in the body: its axis each time, its front by all that was seen so far."""
-        if by_depth is None or not by_depth.front_seen or track.observation.cut_side:
+        """Corrects the yaw by the axis of the body from a network, and the front by accumulated log odds."""
+        if by_depth is None or not by_depth.has_front or track.observation.is_cut_at_side:
             return
         turn = wrap(track.frame.T_world_ego.yaw_rad + by_depth.yaw_rad - track.yaw_rad)
         opposed = abs(turn) > math.pi / 2.0
         logit = by_depth.front_logit / self.config.body_yaw_inflation**2
-        track.front_logit = min(track.front_logit + (-logit if opposed else logit), MOTION_LOGIT)
+        track.front_logit = min(track.front_logit + (-logit if opposed else logit), MOTION_FRONT_LOGIT)
         if opposed:
             turn = wrap(turn - math.pi)
         if track.front_logit < 0.0:
@@ -72,8 +71,8 @@ class YawFilter:
         self._correct(row, track, turn, (self.config.body_yaw_inflation * by_depth.sigma_yaw_rad) ** 2)
 
     def correct_by_outline(self, row: int, track: Track, outline: YawByOutline) -> None:
-        """To the likeliest yaw by its widths so far, while neither motion nor body has given it."""
-        if track.yaw_known or track.observation.cut_side:
+        """Sets the yaw from the widths of the boxes, until motion or body measure it."""
+        if track.is_yaw_known or track.observation.is_cut_at_side:
             return
         yaw_rad, track.sigma_yaw_rad = outline.estimate(row, track.yaw_rad)
         turn = wrap(yaw_rad - track.yaw_rad)
@@ -81,17 +80,17 @@ class YawFilter:
             self._turn(row, track, turn)
 
     def _correct(self, row: int, track: Track, turn: float, variance: float) -> None:
-        """The yaw by a measured turn (rad) with its variance."""
+        """Kalman update by a measured turn (rad) with its variance."""
         before = track.sigma_yaw_rad**2 + (self.config.sigma_yaw_rate_radps * self._dt_s) ** 2
-        gain = before / (before + variance) if track.yaw_known else 1.0
-        track.sigma_yaw_rad = math.sqrt((1.0 - gain) * before if track.yaw_known else variance)
-        track.yaw_known = True
+        gain = before / (before + variance) if track.is_yaw_known else 1.0
+        track.sigma_yaw_rad = math.sqrt((1.0 - gain) * before if track.is_yaw_known else variance)
+        track.is_yaw_known = True
         self._turn(row, track, gain * turn)
 
     def _turn(self, row: int, track: Track, turn: float) -> None:
-        """Turns it by `turn` (rad), and with it what was derived from the old yaw.
+        """Turns the vehicle by `turn` (rad), with everything that depends on the yaw.
 
-        A vehicle turns about what was seen of it: that its centre lies elsewhere than was thought is no motion.
+        It turns about its visible edges; the shift of the centre is not a motion.
         """
         track.yaw_rad = wrap(track.yaw_rad + turn)
         seen, depth_m, ego_yaw_rad = track.observation, track.place.depth_m, track.frame.T_world_ego.yaw_rad
@@ -107,7 +106,7 @@ class YawFilter:
         track.place = msgspec.structs.replace(track.place, centre_m=track.place.centre_m + np.array([x - x0, y - y0]))
 
     def _has_moved(self, track: Track) -> bool:
-        """Whether it has left the place where it was first seen by more than the error of that place explains."""
+        """Whether it has moved significantly from its first place."""
         x, y = track.first_offset_m.tolist()
         dx, dy = (track.state[:2] - track.first_m).tolist()
         distance2 = x * x + y * y
