@@ -21,7 +21,7 @@ from birdslam.graph.around.hidden_road import hidden_fans
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
-from birdslam.people.people_boxes import PeopleBoxesConfig, people_boxes
+from birdslam.people.people_boxes import PeopleBoxesConfig, observe_people
 from birdslam.people.people_config import PeopleConfig
 from birdslam.people.people_records import followed_people
 from birdslam.people.people_tracker import PeopleTracker, PeopleTrackingConfig
@@ -90,7 +90,7 @@ class Scene:
 
 
 def observed(boxes: list[Box], labels: list[str]) -> list[str]:
-    return [box.label for box in people_boxes(found(boxes, labels), CAMERA, CAMERA.ground, PeopleBoxesConfig())]
+    return [box.label for box in observe_people(found(boxes, labels), CAMERA, CAMERA.ground, PeopleBoxesConfig())]
 
 
 # --- which boxes are whom ---
@@ -98,7 +98,7 @@ def observed(boxes: list[Box], labels: list[str]) -> list[str]:
 
 def test_a_rider_and_the_bicycle_are_one_and_a_motorcycles_rider_is_no_pedestrian() -> None:
     person, mount = (600.0, 150.0, 640.0, 250.0), (595.0, 200.0, 645.0, 265.0)
-    (whole,) = people_boxes(found([person, mount], ["person", "bicycle"]), CAMERA, CAMERA.ground, PeopleBoxesConfig())
+    (whole,) = observe_people(found([person, mount], ["person", "bicycle"]), CAMERA, CAMERA.ground, PeopleBoxesConfig())
     assert whole.label == "cyclist"
     assert whole.rows == (0, 1)
     assert whole.box_px == (595.0, 150.0, 645.0, 265.0)
@@ -180,18 +180,18 @@ def test_near_ones_tell_how_tall_all_are_and_far_ones_the_tilt_and_nobody_tells_
     road, camera_m = SharedRoad(config), CAMERA.height_m
     places = [(x_m, y_m) for x_m in (6.5, 8.0, 11.0, 18.0, 28.0, 35.0) for y_m in (-2.0, 2.0)]
     boxes = [box_of(*place, 1.72 * math.exp(0.08), rise=0.02) for place in places]
-    seen = people_boxes(found(boxes), CAMERA, CAMERA.ground, PeopleBoxesConfig())
+    seen = observe_people(found(boxes), CAMERA, CAMERA.ground, PeopleBoxesConfig())
     road.predict(1.0, 0.0, 0.02)
-    road.begin(len(seen))
-    before = road.by_others()
-    road.tell(range(1), seen[:1], RoadProfile(camera_m))
-    np.testing.assert_array_equal(road.by_others()[0], before[0])
-    road.tell(range(1, len(seen)), seen[1:], RoadProfile(camera_m))
-    (tilt, tilt_var), (log_height, height_var) = road.by_others()[-1].tolist()
+    road.add_people(len(seen))
+    before = road.leave_one_out()
+    road.add_boxes(range(1), seen[:1], RoadProfile(camera_m))
+    np.testing.assert_array_equal(road.leave_one_out()[0], before[0])
+    road.add_boxes(range(1, len(seen)), seen[1:], RoadProfile(camera_m))
+    (tilt, tilt_var), (log_height, height_var) = road.leave_one_out()[-1].tolist()
     assert abs(tilt - 0.02) < 2.0 * math.sqrt(tilt_var) < 0.02
     assert 0.02 < log_height < 0.08 + math.sqrt(height_var)
     road.predict(1.0, 0.005, 0.02)  # the front end's ground now has a part of it
-    assert road.by_others()[-1, 0, 0] == pytest.approx(tilt - 0.005, abs=1e-3)
+    assert road.leave_one_out()[-1, 0, 0] == pytest.approx(tilt - 0.005, abs=1e-3)
 
 
 def test_people_on_a_road_that_bends_stand_where_its_rise_puts_them() -> None:

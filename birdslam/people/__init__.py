@@ -1,6 +1,6 @@
-"""People, cyclists and riders in bird's-eye view, with ids that last through a second of hiding.
+"""People, cyclists and riders in bird's-eye view, with ids that persist through a second of occlusion.
 
-`people_boxes` reads a detector's boxes, `box_model` says what the box of somebody looks like, `people_motion` how
-people move, `road_tilt` how the road lies under them; `people_filter` estimates places, velocities and heights by
-these, `people_tracker` follows everybody, `people_records` makes the records of a frame.
+`people_boxes` reads a detector's boxes, `box_model` has their measurement model, `people_motion` the motion model,
+`road_tilt` the road under people. `people_filter` estimates places, velocities and heights, `people_tracker` tracks,
+`people_records` makes the records of a frame.
 """

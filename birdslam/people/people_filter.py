@@ -1,8 +1,8 @@
-"""Where people are and how they move: Kalman filters, one for each way of moving and height, mixed by likelihood.
+"""Positions and velocities of people: Kalman filters per motion and height, mixed by likelihood.
 
-The road places first and the size second: a small box whose foot is near is a child's, and no distant adult's. Tilt,
-kerb and height are states (people_state.py), so that what lasts for a track is not averaged away. Feet that something
-hides are a second hypothesis of each box (box_model.py).
+The road measures the depth, the size second: a small box with a near foot is a child. Tilt, ground offset and height
+are states (people_state.py), so that systematic errors do not average out. Hidden feet are a second hypothesis of each
+box (box_model.py).
 """
 
 from __future__ import annotations
@@ -17,20 +17,26 @@ from birdslam.geometry import bev
 from birdslam.geometry.arrays import Bools, Floats
 from birdslam.geometry.bev import RoadProfile
 from birdslam.geometry.se2 import SE2
-from birdslam.people.box_model import MIN_SLOPE, TALL, UNUSED, WIDTH, expected_boxes, hide_feet, measured_boxes
+from birdslam.people.box_model import MIN_SLOPE, TALL, UNUSED_SIGMA, WIDTH, expected_boxes, hide_feet, measured_boxes
 from birdslam.people.people_boxes import PersonBox
 from birdslam.people.people_config import PeopleConfig
-from birdslam.people.people_motion import change_motions, motions_of, shares, velocities, walk_on
+from birdslam.people.people_motion import (
+    initial_velocities,
+    mix_motions,
+    motion_parameters,
+    motion_priors,
+    predict_motion,
+)
 from birdslam.people.people_state import (
     CHILD_FILTERS,
     FILTERS,
     FOOT,
     HEAD,
     HEIGHT,
-    KERB,
     MOTIONS,
-    STANDING_FILTERS,
+    OFFSET,
     STATES,
+    STATIONARY_FILTERS,
     TILT,
     VELOCITY,
     VX,
@@ -38,22 +44,21 @@ from birdslam.people.people_state import (
     Moments,
     X,
     Y,
-    merged,
+    merge_mixture,
 )
 from birdslam.people.road_tilt import SharedRoad
 
-DEPTH_UNKNOWN = 0.6  # 1-sigma at birth, as a fraction
+INITIAL_DEPTH_SIGMA_REL = 0.6
 BIRTH_ITERATIONS, ITERATIONS = 4, 1
-MIN_WEIGHT = 1e-6  # of a filter: one that was ruled out may come back
+MIN_WEIGHT = 1e-6  # of a filter, so that it can recover
 
 
 class PeopleFilter:
-    """predict() once a frame, then correct() the rows that boxes are of, and begin() new ones.
+    """Calls per frame: predict(), correct() for observed rows, add_people() for new ones.
 
-    State, of each person and each filter: x, y (m), vx, vy (m/s) in the odometry's world, log of the height in metres,
-    tilt (rad) and kerb (m) of the road there against the front end's ground. Measurements: of each box the bearing, the
-    slopes of its bottom and top, the log of its width (box_model.py). Read by `people_tracker` for association, and by
-    `people_records`.
+    State of each person and filter: x, y (m), vx, vy (m/s) in the odometry world, log height (m), tilt (rad) and offset
+    (m) of the ground relative to the front end's ground, errors of the box. Measurements of each box: bearing, bottom,
+    log height, log width (box_model.py). Readers: `people_tracker` for association, and `people_records`.
     """
 
     def __init__(self, config: PeopleConfig) -> None:
@@ -62,20 +67,19 @@ class PeopleFilter:
         self._P = np.zeros((0, FILTERS, len(STATES), len(STATES)))
         self._weight = np.zeros((0, FILTERS))
         self._unseen_s = np.zeros(0)
-        self._log_height = np.zeros((0, FILTERS))  # of a kind's grown-ups and children
+        self._log_height = np.zeros((0, FILTERS))  # of adults and children
         self._sizes = np.zeros((0, 4))  # reach, change, log width, sigma width
-        self._moves = np.zeros((0, len(MOTIONS), 3))  # speed along the road, 1-sigma of it and of that across it
-        # Mean and variance of the tilt and of the log of all heights, as the others have them, and the variances of
-        # somebody's own parts beside them
+        self._moves = np.zeros((0, len(MOTIONS), 3))  # speed along the road, its 1-sigma, 1-sigma across the road
+        # Mean and variance of common tilt and log height from the others, and variances of the own parts
         self._shared, self._own_var = np.zeros((0, 2, 2)), np.zeros((0, FILTERS, 2))
-        self._driving = 1.0  # of a second
+        self._driving = 1.0  # driving fraction of a second
         self.road = SharedRoad(config)
 
     def __len__(self) -> int:
         return len(self._x)
 
     def keep_rows(self, rows: Sequence[int], leaving: Sequence[int]) -> None:
-        """Forgets all others; what those in the rows `leaving` told of the road stays."""
+        """Removes all other rows; the information of the rows `leaving` about the road stays."""
         self.road.keep_rows(rows, leaving)
         self._x, self._P, self._weight = self._x[rows], self._P[rows], self._weight[rows]
         self._unseen_s, self._sizes, self._log_height = self._unseen_s[rows], self._sizes[rows], self._log_height[rows]
@@ -90,9 +94,9 @@ class PeopleFilter:
         ego_mps: float,
         sigma_pitch_rad: float,
     ) -> None:
-        """To the next frame: people move, and the ground's estimate moved by `ground_shift_rad` beside its own motion.
+        """Predicts to the next frame; `ground_shift_rad` is the change of the ground's estimate beyond its motion.
 
-        `ego_cov` (3, 3) is of the ego's step, in its tangent.
+        `ego_cov` (3, 3) is the covariance of the ego's step in its tangent space.
         """
         config, n = self.config, len(self._x)
         self._driving = -math.expm1(-ego_mps / config.driving_mps)
@@ -101,10 +105,10 @@ class PeopleFilter:
         if not n or dt_s <= 0.0:
             return
         self._unseen_s += dt_s
-        self._x, self._P, self._weight = change_motions(
+        self._x, self._P, self._weight = mix_motions(
             self._x, self._P, self._weight, self._moves, dt_s, T_world_ego.yaw_rad, config
         )
-        self._x, self._P = walk_on(self._x, self._P, self._sizes[:, 1], dt_s)
+        self._x, self._P = predict_motion(self._x, self._P, self._sizes[:, 1], dt_s)
         self._shared[:, 0, 0] -= ground_shift_rad
         mean, var = self._shared[:, 0].T
         self._x[..., TILT] = mean[:, None] + keep * (self._x[..., TILT] - ground_shift_rad - mean[:, None])
@@ -118,25 +122,25 @@ class PeopleFilter:
             self._P[..., state, :] *= keep
             self._P[..., state] *= keep
             self._P[..., state, state] += (1.0 - keep**2) * config.sigma_outline_rel**2
-        if ego_cov is not None:  # an error of the ego's step moves everybody against it
+        if ego_cov is not None:  # an error of the ego step moves all people in ego
             from_ego = self._x[..., :2] - [T_world_ego.x_m, T_world_ego.y_m]
             J = np.zeros((n, FILTERS, 2, 3))
             J[..., :2, :2] = T_world_ego.rotation()
             J[..., 0, 2], J[..., 1, 2] = -from_ego[..., 1], from_ego[..., 0]
             self._P[..., :2, :2] += J @ ego_cov @ J.swapaxes(-1, -2)
 
-    def begin(self, boxes: Sequence[PersonBox], T_world_ego: SE2, road: RoadProfile) -> None:
-        """People seen for the first time, each in a row after the others, already corrected by their boxes."""
+    def add_people(self, boxes: Sequence[PersonBox], T_world_ego: SE2, road: RoadProfile) -> None:
+        """Adds new people in rows after the others, and corrects them by their boxes."""
         if not boxes:
             return
-        config, n, before, shared = self.config, len(boxes), len(self._x), self.road.by_others()[-1]
+        config, n, before, shared = self.config, len(boxes), len(self._x), self.road.leave_one_out()[-1]
         x, P = np.zeros((n, FILTERS, len(STATES))), np.zeros((n, FILTERS, len(STATES), len(STATES)))
         weight, rows = np.zeros((n, FILTERS)), np.zeros((n, 4))
         log_height = np.zeros((n, FILTERS))
         moves, own_var = np.zeros((n, len(MOTIONS), 3)), np.zeros((n, FILTERS, 2))
         for k, box in enumerate(boxes):
             sizes = config.sizes(box.label)
-            moves[k] = motions_of(sizes, config)
+            moves[k] = motion_parameters(sizes, config)
             own_var[k, :, 0] = config.sigma_tilt_rad**2 + (config.sigma_roll_rad * box.bearing) ** 2
             rows[k] = [
                 sizes.reach_m, sizes.change_mps, math.log(sizes.width_m), sizes.sigma_width_rel
@@ -148,23 +152,23 @@ class PeopleFilter:
                 both = slice(len(MOTIONS) * child, len(MOTIONS) * (child + 1))
                 x[k, both, :2] = T_world_ego @ np.array([x_m, box.bearing * x_m])
                 log_height[k, both] = math.log(h_m)
-                x[k, both, HEIGHT], x[k, both, KERB] = math.log(h_m) + shared[1, 0], config.kerb_m
-                P[k, both, :2, :2] = np.eye(2) * (DEPTH_UNKNOWN * x_m) ** 2
+                x[k, both, HEIGHT], x[k, both, OFFSET] = math.log(h_m) + shared[1, 0], config.kerb_m
+                P[k, both, :2, :2] = np.eye(2) * (INITIAL_DEPTH_SIGMA_REL * x_m) ** 2
                 own_var[k, both, 1] = config.own_height_var(sigma)
-                weight[k, both] = (sizes.child if child else 1.0 - sizes.child) * shares(config)
+                weight[k, both] = (sizes.child if child else 1.0 - sizes.child) * motion_priors(config)
             x[k, :, TILT] = shared[0, 0]
             P[k, :, [TILT, HEIGHT], [TILT, HEIGHT]] = (shared[:, 1] + own_var[k]).T
             P[k, :, [FOOT, HEAD], [FOOT, HEAD]] = config.sigma_outline_rel**2
-            P[k, :, KERB, KERB] = config.sigma_kerb_m**2
+            P[k, :, OFFSET, OFFSET] = config.sigma_kerb_m**2
         self._moves = np.concatenate([self._moves, moves])
-        mean, cov = velocities(self._moves, T_world_ego.yaw_rad)
+        mean, cov = initial_velocities(self._moves, T_world_ego.yaw_rad)
         x[..., VELOCITY] = np.tile(mean[before:], (1, 2, 1))
         P[..., VELOCITY, VELOCITY] = np.tile(cov[before:], (1, 2, 1, 1))
         self._x, self._P = np.concatenate([self._x, x]), np.concatenate([self._P, P])
         self._weight = np.concatenate([self._weight, weight])
         self._sizes = np.concatenate([self._sizes, rows])
         self._shared = np.concatenate([self._shared, np.tile(shared, (n, 1, 1))])
-        self.road.begin(n)
+        self.road.add_people(n)
         self._log_height = np.concatenate([self._log_height, log_height])
         self._own_var = np.concatenate([self._own_var, own_var])
         self._unseen_s = np.concatenate([self._unseen_s, np.full(n, max(config.box_memory_s, config.width_memory_s))])
@@ -178,13 +182,15 @@ class PeopleFilter:
         road: RoadProfile,
         iterations: int = ITERATIONS,
     ) -> None:
-        """The people in `rows` by their boxes, one each."""
+        """Updates the people in `rows` by their boxes, one each."""
         if not boxes:
             return
         at = np.asarray(rows)
-        self.road.tell(rows, boxes, road)
+        self.road.add_boxes(rows, boxes, road)
         z, R = self._measured(at, boxes)  # (M, 4), (M, 4, 4)
-        counts = np.minimum(1.0, self._unseen_s[at] / self.config.box_memory_s)[:, None, None]  # as so many boxes
+        counts = np.minimum(1.0, self._unseen_s[at] / self.config.box_memory_s)[
+            :, None, None
+        ]  # effective number of independent boxes
         hidden = np.array([box.hidden for box in boxes])
         x0, P0 = self._x[at][:, :, None], self._P[at][:, :, None]  # (M, K, 1, 9)
         x = np.repeat(x0, 2, axis=2)
@@ -201,36 +207,36 @@ class PeopleFilter:
             x = x0 + (gain @ innovation[..., None])[..., 0]
         P = P0 - gain @ PJt.swapaxes(-1, -2)
         P = (P + P.swapaxes(-1, -2)) / 2.0
-        # Boxes with the same error are evidence of one: else the filter that expects least wins by being repeated
+        # Evidence of one box, since errors are correlated; otherwise repeated boxes favour one filter
         squared = (innovation[..., None, :] @ np.linalg.inv(of_one_box) @ innovation[..., None])[..., 0, 0]
         evidence = -0.5 * (squared + np.linalg.slogdet(of_one_box)[1])
         evidence += np.log(np.stack([1.0 - hidden, hidden], axis=1))[:, None]
         most = evidence.max(axis=2, keepdims=True)
         share = np.exp(evidence - most)
         total = share.sum(axis=2, keepdims=True)
-        self._x[at], self._P[at] = merged(x, P, share / total)
+        self._x[at], self._P[at] = merge_mixture(x, P, share / total)
         log_weight = np.log(np.maximum(self._weight[at], 1e-300)) + (counts * (most + np.log(total)))[..., 0]
         weight = np.maximum(np.exp(log_weight - log_weight.max(axis=1, keepdims=True)), MIN_WEIGHT)
         self._weight[at] = weight / weight.sum(axis=1, keepdims=True)
         self._unseen_s[at] = 0.0
 
     def _measured(self, at: NDArray[np.intp], boxes: Sequence[PersonBox]) -> tuple[Floats, Floats]:
-        """(M, 4) of the boxes, and their covariances (M, 4, 4)."""
+        """Measurements (M, 4) of the boxes, and their covariances (M, 4, 4)."""
         z, R = measured_boxes(boxes)
-        uses = np.array([b.whole for b in boxes]) & (self._unseen_s[at] >= self.config.width_memory_s)
-        R[:, WIDTH, WIDTH] = np.where(uses, self._sizes[at, 3], UNUSED) ** 2
+        uses = np.array([b.is_complete for b in boxes]) & (self._unseen_s[at] >= self.config.width_memory_s)
+        R[:, WIDTH, WIDTH] = np.where(uses, self._sizes[at, 3], UNUSED_SIGMA) ** 2
         return z, R
 
     def moments(self, after_s: float = 0.0, stands: Bools | None = None) -> Moments:
-        """Of everybody, `after_s` later, as they move.
+        """Moments of all people, extrapolated by `after_s`.
 
-        The velocity is the one of whoever moves, or none of whom `stands` (N,); its covariance is about that, with the
-        probability of the other in it.
+        The velocity is that of the moving filters, or 0 for `stands` (N,); the covariance about it includes the
+        probability of the other case.
         """
-        mean, cov = merged(self._x, self._P, self._weight)
-        standing = self._weight[:, STANDING_FILTERS].sum(axis=1)
+        mean, cov = merge_mixture(self._x, self._P, self._weight)
+        standing = self._weight[:, STATIONARY_FILTERS].sum(axis=1)
         moving = self._weight.copy()
-        moving[:, STANDING_FILTERS] = 0.0
+        moving[:, STATIONARY_FILTERS] = 0.0
         velocity = (moving[..., None] * self._x[..., VELOCITY]).sum(axis=1) / moving.sum(axis=1)[:, None]
         if stands is not None:
             velocity[stands] = 0.0
@@ -246,13 +252,13 @@ class PeopleFilter:
             cov[:, [VX, VY], [VX, VY]] += (q * after_s)[:, None]
         return Moments(mean, cov, standing, self._weight[:, CHILD_FILTERS].sum(axis=1))
 
-    def share(self) -> None:
-        """What each shares with all others is known again, and replaces what was known before.
+    def update_shared_priors(self) -> None:
+        """Replaces the prior of the common tilt and height in each filter by the current one.
 
-        Each filter has the old prior in it as information of rank one, in whose place the new one comes. That of the
-        tilt is forgotten as the ego drives, and predict() draws the tilt to the new one.
+        The priors are information of rank one. The prior of the tilt fades while the ego drives, since predict() draws
+        the tilt to the new one.
         """
-        shared = self.road.by_others()[:-1]
+        shared = self.road.leave_one_out()[:-1]
         means = ((TILT, np.zeros((1, 1)), 1.0 - self._driving), (HEIGHT, self._log_height, 1.0))
         for k, (state, base, kept) in enumerate(means):
             before, now = (1.0 / (self._own_var[..., k] + part[:, None, k, 1]) for part in (self._shared, shared))
@@ -265,16 +271,18 @@ class PeopleFilter:
         self._shared = shared
 
     def distances(self, boxes: Sequence[PersonBox], T_world_ego: SE2, road: RoadProfile) -> tuple[Floats, Floats]:
-        """(N, M) squared Mahalanobis distances of boxes from everybody, and -2 log of their likelihoods.
+        """(N, M) squared Mahalanobis distances of boxes from people, and -2 log likelihoods.
 
-        Each is the better one of feet visible and hidden.
+        Each is for the better hypothesis, visible or hidden feet.
         """
         n = len(self._x)
         x = np.repeat(self._x[:, :, None], 2, axis=2)
         expected, J = expected_boxes(x, T_world_ego, road, self._sizes[:, 0], self._sizes[:, 2], self.config)
         expected, J = expected[..., :WIDTH], J[..., :WIDTH, :]
         S = J @ self._P[:, :, None] @ J.swapaxes(-1, -2)
-        mean, S = merged(expected.swapaxes(1, 2), S.swapaxes(1, 2), self._weight[:, None])  # (N, 2, 3), (N, 2, 3, 3)
+        mean, S = merge_mixture(
+            expected.swapaxes(1, 2), S.swapaxes(1, 2), self._weight[:, None]
+        )  # (N, 2, 3), (N, 2, 3, 3)
         z, R = measured_boxes(boxes)
         noise = np.stack([R, R])
         hide_feet(noise[1], np.exp(z[:, TALL]) / (1.0 - self.config.hidden_share), self.config)

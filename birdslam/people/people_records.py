@@ -1,4 +1,4 @@
-"""What a frame's record says of everybody who is followed, as they are in that frame."""
+"""Records of all tracked people in a frame."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from birdslam.people.people_tracker import PeopleTracker
 from birdslam.types import FollowedPerson, Moves
 from birdslam.vehicles.track import EgoFrame
 
-KNOWN_FRAMES = 4  # frames before a person is reported as standing
+MIN_REPORT_FRAMES = 4  # number of observations until the motion is reported
 
 
 def followed_people(tracker: PeopleTracker, present: EgoFrame) -> tuple[FollowedPerson, ...]:
-    """Of the present frame; people were seen in it or in an earlier one, and go on as they moved."""
+    """Records of the current frame; people of an earlier frame are extrapolated."""
     tracks, frame = tracker.tracks, tracker.frame
     if not tracks or frame is None:
         return ()
     after_s = max(0.0, (present.t_source_ns - frame.ego.t_source_ns) * 1e-9)
-    stand = np.array([track.stands and track.hits >= KNOWN_FRAMES for track in tracks], dtype=np.bool_)
+    stand = np.array([track.is_stationary and track.hits >= MIN_REPORT_FRAMES for track in tracks], dtype=np.bool_)
     moments = tracker.filter.moments(after_s, stand)
     R, T = present.T_world_ego.rotation(), present.T_world_ego
     at = ((moments.mean[:, :2] - [T.x_m, T.y_m]) @ R).tolist()
@@ -36,7 +36,7 @@ def followed_people(tracker: PeopleTracker, present: EgoFrame) -> tuple[Followed
         height_m = math.exp(log_height[k])
         sizes = tracker.config.people.sizes(track.label)
         (x, y), (vx, vy) = at[k], velocity[k]
-        moves = Moves.STANDING if stands[k] else Moves.DRIVING if track.hits >= KNOWN_FRAMES else Moves.UNDECIDED
+        moves = Moves.STANDING if stands[k] else Moves.DRIVING if track.hits >= MIN_REPORT_FRAMES else Moves.UNDECIDED
         out.append(
             FollowedPerson(
                 person=track.person,

@@ -1,10 +1,10 @@
-"""The state of one person, how people move, and what a mixture of filters amounts to.
+"""State of a person, the motions, and the moments of a mixture of filters.
 
-    x = [x, y, vx, vy, log h, tilt, kerb, foot, head]
+    x = [x, y, vx, vy, log h, tilt, offset, foot, head]
 
-Place (m) and velocity (m/s) are in the odometry's world, `h` is the height in metres, `tilt` (rad) and `kerb` (m, the
-road under the feet lies lower by it) are of the road there against the front end's ground, `foot` and `head` are errors
-of the box that last for a while, as shares of its height: somebody's pose, what a detector makes of clothes.
+Position (m) and velocity (m/s) are in the odometry world, `h` is the height in metres. `tilt` (rad) and `offset` (m,
+downwards) are of the ground at the person relative to the front end's ground. `foot` and `head` are correlated errors
+of the edges of the box, relative to its height.
 """
 
 from __future__ import annotations
@@ -13,17 +13,17 @@ from dataclasses import dataclass
 
 from birdslam.geometry.arrays import Floats
 
-STATES = X, Y, VX, VY, HEIGHT, TILT, KERB, FOOT, HEAD = range(9)
+STATES = X, Y, VX, VY, HEIGHT, TILT, OFFSET, FOOT, HEAD = range(9)
 VELOCITY = slice(2, 4)
-# Who moves along the road comes towards the ego or goes away from it; others cross, or walk anyhow
-MOTIONS = STANDING, TOWARDS, AWAY, CROSSING = range(4)
-FILTERS = 2 * len(MOTIONS)  # for an adult's height, and for a child's
-STANDING_FILTERS, CHILD_FILTERS = [STANDING, len(MOTIONS) + STANDING], slice(len(MOTIONS), None)
+# TOWARDS and AWAY move along the road, CROSSING in any direction
+MOTIONS = STATIONARY, TOWARDS, AWAY, CROSSING = range(4)
+FILTERS = 2 * len(MOTIONS)  # for the height of an adult, and of a child
+STATIONARY_FILTERS, CHILD_FILTERS = [STATIONARY, len(MOTIONS) + STATIONARY], slice(len(MOTIONS), None)
 
 
 @dataclass(frozen=True)
 class Moments:
-    """Means (N, 9) and covariances (N, 9, 9) of the mixtures, and the probabilities (N,) of standing and a child."""
+    """Means (N, 9) and covariances (N, 9, 9) of the mixtures; probabilities (N,) of standing and of a child."""
 
     mean: Floats
     cov: Floats
@@ -31,8 +31,8 @@ class Moments:
     child: Floats
 
 
-def merged(x: Floats, P: Floats, weight: Floats) -> tuple[Floats, Floats]:
-    """Mean (..., S) and covariance (..., S, S) of Gaussian mixtures (..., C, S), (..., C, S, S) by weights (..., C)."""
+def merge_mixture(x: Floats, P: Floats, weight: Floats) -> tuple[Floats, Floats]:
+    """Mean (..., S), covariance (..., S, S) of Gaussian mixtures (..., C, S), (..., C, S, S), weights (..., C)."""
     mean = (weight[..., None] * x).sum(axis=-2)
     gap = x - mean[..., None, :]
     spread = P + gap[..., :, None] * gap[..., None, :]

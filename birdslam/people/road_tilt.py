@@ -1,11 +1,11 @@
-"""The road's tilt and how tall people are, as far as all who are there share them.
+"""Common tilt of the road and common height of people, from all people.
 
-With T the road's tilt against the front end's ground and h the log of a factor on all heights, a box asks for the tilt
+With the tilt T of the road relative to the front end's ground and the log h of a common factor on heights, a box gives
 
-    t = T + (H / depth) D + own,   D = h - kerb / H:
+    t = T + (H / depth) D + own,   D = h - offset / H:
 
-far ones tell the tilt, near ones D: the height, or a pavement under all. A person is one sample, the mean of its boxes,
-so that its own height is not averaged away. What all others tell is the prior of each.
+Far boxes measure the tilt, near ones D: height or pavement. Each person is one sample, the mean of its boxes. The prior
+of each person comes from all others.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from birdslam.people.people_boxes import PersonBox
 from birdslam.people.people_config import PeopleConfig
 
 ITERATIONS = 4
-_T, _D, _TILT = range(3)  # of a sample
+_T, _D, _TILT = range(3)  # indices of a sample
 _SHARED = slice(_T, _D + 1)
 
 
-def samples_of(boxes: Sequence[PersonBox], road: RoadProfile, config: PeopleConfig) -> Floats:
-    """(N, 3, 3): of each box w a a', with a = (1, H / depth, t) and w the information of t; nothing of hidden feet."""
+def make_samples(boxes: Sequence[PersonBox], road: RoadProfile, config: PeopleConfig) -> Floats:
+    """(N, 3, 3) w a a' of each box, a = (1, H / depth, t), w the information of t; 0 with hidden feet."""
     out = np.zeros((len(boxes), 3, 3))
     for k, box in enumerate(boxes):
-        if not box.whole or box.hidden > config.sure_feet or box.tan_height <= MIN_SLOPE:
+        if not box.is_complete or box.hidden > config.sure_feet or box.tan_height <= MIN_SLOPE:
             continue
         sizes = config.sizes(box.label)
         depth = sizes.height_m / box.tan_height
@@ -44,65 +44,66 @@ def samples_of(boxes: Sequence[PersonBox], road: RoadProfile, config: PeopleConf
 
 
 class SharedRoad:
-    """predict() once a frame, tell() it the boxes, then by_others(). Row k is the k-th person's.
+    """Calls per frame: predict(), add_boxes(), leave_one_out(). Row k is the k-th person.
 
-    State: T (rad) and D by those who left, with their covariance; until somebody has, they are of the prior. Of each
-    person the sum of the samples and how many they were.
+    State: T (rad) and D from removed people, with their covariance, or the prior. For each person the sum of its
+    samples and their number.
     """
 
     def __init__(self, config: PeopleConfig) -> None:
         self.config = config
         self._x = np.zeros(2)
         self._P = np.diag([config.sigma_common_tilt_rad**2, config.sigma_common_rel**2 + config.sigma_pavement_rel**2])
-        self._known = False
-        self._reported, self._boxes = np.zeros((0, 3, 3)), np.zeros(0)
+        self._is_known = False
+        self._sums, self._boxes = np.zeros((0, 3, 3)), np.zeros(0)
 
-    def begin(self, count: int) -> None:
-        """People seen for the first time, in rows after the others."""
-        self._reported = np.concatenate([self._reported, np.zeros((count, 3, 3))])
+    def add_people(self, count: int) -> None:
+        """Adds new people in rows after the others."""
+        self._sums = np.concatenate([self._sums, np.zeros((count, 3, 3))])
         self._boxes = np.append(self._boxes, np.zeros(count))
 
     def keep_rows(self, rows: Sequence[int], leaving: Sequence[int]) -> None:
-        """Forgets all others; of those in the rows `leaving` what they told stays."""
+        """Removes all other rows; the information of the rows `leaving` stays."""
         if len(leaving):
             reported, prior = self._samples()[leaving].sum(axis=0), np.linalg.inv(self._P)
             P = np.linalg.inv(reported[_SHARED, _SHARED] + prior)
-            self._x, self._P, self._known = P @ (reported[_SHARED, _TILT] + prior @ self._x), P, True
-        self._reported, self._boxes = self._reported[rows], self._boxes[rows]
+            self._x, self._P, self._is_known = P @ (reported[_SHARED, _TILT] + prior @ self._x), P, True
+        self._sums, self._boxes = self._sums[rows], self._boxes[rows]
 
     def predict(self, keep: float, shift_rad: float, sigma_pitch_rad: float) -> None:
-        """To the next frame: `keep` of the tilt lasts; the front end's ground, known to `sigma_pitch_rad`, got
-        `shift_rad` more pitch.
+        """Predicts to the next frame: the factor `keep` on the tilt, the change `shift_rad` of the front end's pitch.
+
+        `sigma_pitch_rad` is the 1-sigma of that pitch.
         """
         prior_var = sigma_pitch_rad**2 + self.config.sigma_common_tilt_rad**2
-        self._x[_T] = keep * (self._x[_T] - shift_rad) if self._known else 0.0
+        self._x[_T] = keep * (self._x[_T] - shift_rad) if self._is_known else 0.0
         self._P *= np.outer([keep, 1.0], [keep, 1.0])
-        self._P[_T, _T] = self._P[_T, _T] + (1.0 - keep**2) * prior_var if self._known else prior_var
+        self._P[_T, _T] = self._P[_T, _T] + (1.0 - keep**2) * prior_var if self._is_known else prior_var
         M = np.eye(3)
         M[_TILT, _T] = -shift_rad
-        self._reported, self._boxes = keep * (M @ self._reported @ M.T), keep * self._boxes
+        self._sums, self._boxes = keep * (M @ self._sums @ M.T), keep * self._boxes
 
-    def tell(self, rows: Sequence[int], boxes: Sequence[PersonBox], road: RoadProfile) -> None:
-        """The boxes of the people in `rows`, one each."""
-        at, samples = np.asarray(rows), samples_of(boxes, road, self.config)
-        self._reported[at] += samples
+    def add_boxes(self, rows: Sequence[int], boxes: Sequence[PersonBox], road: RoadProfile) -> None:
+        """Adds the boxes of the people in `rows`, one each."""
+        at, samples = np.asarray(rows), make_samples(boxes, road, self.config)
+        self._sums[at] += samples
         self._boxes[at] += samples[:, 0, 0] > 0.0
 
-    def by_others(self) -> Floats:
-        """(N + 1, 2, 2): means and variances of T and h as all others tell them; the last row is by all."""
+    def leave_one_out(self) -> Floats:
+        """(N + 1, 2, 2) means and variances of T and h from all others; the last row is from all."""
         samples = np.concatenate([self._samples(), np.zeros((1, 3, 3))])
         others, prior = samples.sum(axis=0) - samples, np.linalg.inv(self._P)
         P = np.linalg.inv(others[:, _SHARED, _SHARED] + prior)
         x = (P @ (others[:, _SHARED, _TILT] + prior @ self._x)[..., None])[..., 0]
         height_var = self.config.sigma_common_rel**2
-        share = height_var / (height_var + self.config.sigma_pavement_rel**2)  # of D, that is of heights
+        share = height_var / (height_var + self.config.sigma_pavement_rel**2)  # fraction of D that is due to heights
         means, variances = x * [1.0, share], np.diagonal(P, axis1=1, axis2=2) * [1.0, share**2]
         variances[:, _D] += (1.0 - share) * height_var
         return np.stack([means, variances], axis=-1)
 
     def _samples(self) -> Floats:
-        """(N, 3, 3) means of each one's boxes, with weights of Cauchy: a child, or hidden feet, tells another tilt."""
-        samples = self._reported / np.maximum(self._boxes, 1.0)[:, None, None]
+        """(N, 3, 3) mean samples of each person with robust weights (Cauchy), against children and hidden feet."""
+        samples = self._sums / np.maximum(self._boxes, 1.0)[:, None, None]
         prior, weight = np.linalg.inv(self._P), np.ones(len(samples))
         for _ in range(ITERATIONS):
             reported = (weight[:, None, None] * samples).sum(axis=0)
