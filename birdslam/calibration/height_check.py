@@ -1,8 +1,7 @@
-"""A check of the camera's height by independent knowledge.
+"""Checks of the camera height by independent measurements.
 
-The metric scale of one camera is its height: the images alone can't tell whether it is right. What can is a speed or
-poses of the recording, the sizes of vehicles (vehicles/camera_height.py measures them) or the width of lanes
-(lane_width.py); each gives a height with its sigma. The vehicles give pitch and roll as well.
+The camera height defines the metric scale, so images alone cannot check it. Known speeds or poses, sizes of vehicles
+(vehicles/camera_height.py) and widths of lanes (lane_width.py) each give a height with its sigma.
 """
 
 from __future__ import annotations
@@ -34,14 +33,14 @@ KnownLength = Callable[[int, int, int, int], float | None]  # (frames from, to; 
 
 
 class HeightCheckConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The uncertainty of known lengths."""
+    """Uncertainty of known lengths."""
 
     section_m: Positive = 8.0  # over which an estimated length is compared with a known one
     sigma_scale_rel: Positive = 0.015  # of the mean ratio of lengths
 
 
 class VehicleHeightConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The uncertainty of the camera's height by boxes of vehicles."""
+    """Uncertainty of the camera height from boxes of vehicles."""
 
     sigma_class_rel: Positive = 0.04  # of the mean height of a class on a country's roads, and of a detector's boxes
     sigma_bounce_rad: Positive = 0.008  # of the camera's pitch in one frame against its mean
@@ -53,7 +52,7 @@ class VehicleHeightConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
 
 
 class HeightCheck(msgspec.Struct, frozen=True, kw_only=True):
-    """The camera's height by something of known size or speed."""
+    """Camera height from something of known size or speed."""
 
     cue: str
     height_m: float
@@ -77,7 +76,7 @@ def checks_by_length(
     camera: Camera,
     config: HeightCheckConfig,
 ) -> list[HeightCheck]:
-    """By each of `lengths` that covers enough of the way."""
+    """Checks by each of `lengths` that covers enough of the drive."""
     checks = (_by_length(cue, known, steps, times_ns, camera, config) for cue, known in lengths.items())
     return [check for check in checks if check is not None]
 
@@ -85,7 +84,7 @@ def checks_by_length(
 def checks_by_vehicles(
     boxes: Sequence[BoxHeight], camera: Camera, cov: Floats, config: VehicleHeightConfig
 ) -> list[HeightCheck]:
-    """One, or none where too few vehicles were seen; `cov` (2, 2) is of the camera's pitch and roll."""
+    """One check, or none with too few vehicles; `cov` (2, 2) is that of pitch and roll."""
     prior = np.array([camera.height_m, camera.pitch_rad, camera.roll_rad])
     prior_cov = np.zeros((3, 3))
     prior_cov[0, 0] = (0.5 * camera.height_m) ** 2

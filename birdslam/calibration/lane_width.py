@@ -1,6 +1,6 @@
-"""The camera's height by the width of lanes: that of a lane over the camera's height shows in any image of it.
+"""Camera height from the width of painted lanes.
 
-Neither the focal length nor the motion is in it. Lanes are 2.75 to 3.75 m wide, by country and road.
+The image shows the ratio of lane width to camera height, without focal length or motion. Lanes are 2.75 to 3.75 m wide.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ from birdslam.calibration.height_check import LANES, HeightCheck
 from birdslam.lanes.topology import AT_M, WIDTH_M, WIDTH_SIGMA_M
 from birdslam.types import Bound, Lanes
 
-MIN_WAY_M = 20.0  # under painted lanes: less may be a turning lane, or a bay
-_ALIKE_M = 30.0  # a lane widens and narrows over some such way
+MIN_WAY_M = 20.0  # minimum distance under painted lanes: less may be a turning lane
+_ALIKE_M = 30.0  # correlation length of the width of lanes
 
 
 class LaneWidth(NamedTuple):
-    """The width of the ego's lane as one frame shows it (m, at the height that was assumed), and the way driven (m)."""
+    """Width of the ego's lane in one frame (m, at the assumed height), and the distance travelled (m)."""
 
     width_m: float
     way_m: float
 
 
 def painted_width_m(lanes: Lanes | None) -> float | None:
-    """Of the ego's lane where paint bounds it on both sides, `AT_M` ahead."""
+    """Width of the ego's lane `AT_M` ahead if paint bounds it on both sides, else None."""
     if lanes is None or lanes.ego_index is None:
         return None
     lane = lanes.lanes[lanes.ego_index]
@@ -37,7 +37,7 @@ def painted_width_m(lanes: Lanes | None) -> float | None:
 
 
 def checks_by_lanes(seen: Sequence[LaneWidth], camera_height_m: float, sigma_pitch_rad: float) -> list[HeightCheck]:
-    """One, or none where too little was seen of painted lanes. The widths were seen at `camera_height_m`."""
+    """One check, or none with too few painted lanes. The widths were measured at `camera_height_m`."""
     widths_m, ways_m = (np.array(part) for part in zip(*seen, strict=True)) if seen else (np.zeros(0), np.zeros(0))
     way_m = float(ways_m.sum())
     if way_m < MIN_WAY_M:
