@@ -1,9 +1,8 @@
-"""How a camera is mounted in its car, from a drive: pitch and roll over the road, and a check of its height.
+"""Mounting of a camera from a drive: pitch and roll over the road, and checks of its height.
 
-Four cues, each with its covariance, are averaged by least squares, and their disagreement widens the covariance
-(Birge's ratio): the homography of the road plane between two images (road/alignment.py); the direction of travel, whose
-epipole on a straight way lies on the road's horizon; the vanishing point of the road's lines (road/vanishing_point.py);
-the vehicles, whose bottoms and heights give the horizon (vehicles/camera_height.py). height_check.py has the height.
+Least squares over four cues with covariances, widened by their disagreement (Birge's ratio): homography of the road
+(road/alignment.py), direction of travel, vanishing point of the road's lines (road/vanishing_point.py), and vehicles
+(vehicles/camera_height.py).
 """
 
 from __future__ import annotations
@@ -42,11 +41,11 @@ UNOBSERVED_RAD = 10.0  # 1-sigma of what is not observed
 
 
 class CalibrationError(ValueError):
-    """A drive that does not determine the camera; the message says what it lacks."""
+    """The drive does not determine the camera; the message states what is missing."""
 
 
 class CalibrationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The uncertainty of each cue, and what a drive must show."""
+    """Uncertainty of each cue, and requirements on a drive."""
 
     vehicles: VehicleHeightConfig = VehicleHeightConfig()
     height: HeightCheckConfig = HeightCheckConfig()
@@ -95,7 +94,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class _RecordingOdometry(Odometry):
-    """The odometry of the front end, which keeps its last motion."""
+    """The front end's odometry, which keeps its last motion."""
 
     motion: Motion | None = None
 
@@ -111,7 +110,7 @@ class _RecordingOdometry(Odometry):
 
 @dataclass
 class Observations:
-    """The measurements of one drive."""
+    """Measurements of one drive."""
 
     fits: list[tuple[RoadFit, float]] = field(default_factory=list)  # and the distance since the one before
     directions: list[tuple[Floats, float]] = field(default_factory=list)  # of straight travel, and its length
@@ -143,7 +142,7 @@ def calibrate(
     config: CalibrationConfig,
     lengths: dict[str, KnownLength] | None = None,
 ) -> Calibration:
-    """From all frames of a drive, which is repeated where it started with a tilt too far off.
+    """Calibrates from all frames of a drive, which is repeated if the initial tilt was far off.
 
     `lengths` are known distances between two frames, by name of their source. Raises CalibrationError.
     """
@@ -227,7 +226,7 @@ def _cue_estimates(seen: Observations, camera: Camera, config: CalibrationConfig
 
 
 def by_road(seen: Observations, camera: Camera, config: CalibrationConfig) -> CueEstimate | None:
-    """The mean over the alignments of the road; those within one bounce of the car count as one sample."""
+    """Robust mean over the alignments of the road; those within bounce_m count as one sample."""
     if len(seen.fits) < config.min_fits:
         return None
     # In each the tilt is correlated with the length of its step, which the running scale knows better, and with the

@@ -1,9 +1,8 @@
-"""A lens from the drive alone: focal length and radial distortion, by bundle adjustment of short windows of images.
+"""Lens self-calibration from a drive: focal length and radial distortion by bundle adjustment of short windows.
 
-Two images do not show a lens: its distortion trades against its focal length and the motion. Several do, where corners
-pass outwards through the image, and only a camera that turns shows the focal length (Sturm, "Critical motion
-sequences", CVPR 1997). So each window has images, corners that all of them show, and poses and corners of its own; the
-lens is common to all. The principal point is the image's centre, the pixels are square, higher terms are left out.
+Two images do not determine distortion, and only rotation determines the focal length (Sturm, "Critical motion
+sequences", CVPR 1997). Each window has its own poses and corners; the lens is shared. The principal point is the image
+centre, pixels are square, higher terms are 0.
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
-"""Bundle adjustment of short windows of images together with the lens that they share: focal length and distortion.
+"""Bundle adjustment of short windows with shared focal length, distortion and readout time.
 
-Each corner has three numbers, so that no image's noise is taken for the truth. Normal equations are reduced twice: by
-the corners, and by each window's poses, since windows share the lens alone. The lens has the time with it that the
-camera takes to read its rows, one after the other: each corner is where it is seen from at its own row's time (Hedborg
-et al., "Rolling shutter bundle adjustment", CVPR 2012), the camera going on as between its window's images.
+Normal equations are reduced by the corners and by the poses of each window (Schur complement). Each corner is observed
+at the time of its row (Hedborg et al., CVPR 2012).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Windows of a drive that show its lens: images between which corners have moved, and where their adjustment begins."""
+"""Windows of a drive for lens calibration: selection of images and corners, and initialization."""
 
 from __future__ import annotations
 

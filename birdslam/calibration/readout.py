@@ -1,9 +1,7 @@
-"""How long a camera takes to read its rows, by the drive itself: bundle adjustment of short windows of near corners.
+"""Readout time of a rolling shutter from a drive, by bundle adjustment of short windows of near corners.
 
-A point of the road that comes nearer moves down the image, is read later, and has come nearer still: what is low in the
-image moves by too much against what is in its middle, the more the faster the car drives. No lens and no motion does
-that to all windows alike (Albl et al., "On the two-view geometry of unsynchronized cameras and rolling shutter", CVPR
-2016; here the lens is known before). Nothing in a file tells the time, so what is usual is counted beside it.
+A near point that moves down the image is read later, so its displacement in the lower part is too large, in proportion
+to the speed (Albl et al., CVPR 2016; here with a known lens). The estimate is fused with a prior of typical cameras.
 """
 
 from __future__ import annotations
@@ -49,9 +47,9 @@ def readout_of_drive(
     focal_sigma_rel: float = 0.0,
     k1_sigma: float = 0.0,
 ) -> Readout:
-    """By the corners of a drive's raw images and a camera whose lens is known so well; USUAL where they show nothing.
+    """Readout time from corners of raw images and a camera with this lens uncertainty; USUAL without evidence.
 
-    The drive and what is usual are each weighed by their information.
+    Drive and prior are fused by their information.
     """
     focal_px = 0.5 * (camera.fx_px + camera.fy_px)
     middle = 0.5 * (np.array([camera.width_px, camera.height_px], dtype=np.float64) - 1.0)

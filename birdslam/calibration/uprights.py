@@ -1,10 +1,8 @@
-"""A lens by what is upright in the world: edges of houses, poles and signs, in images of one drive.
+"""Lens from vertical edges in the world: houses, poles and signs (plumb lines; Brown 1971).
 
-A lens without distortion shows them as straight lines through one vanishing point, however the car drives; a real one
-bends them, and so tilts each piece of them by where it lies in the image (plumb lines; Brown, "Close-range camera
-calibration", 1971). So a straight drive shows the distortion here, which its motion hardly does, and whether the lens
-is a fisheye. Of the focal length it shows nothing, but that of a fisheye, whose distortion is its focal length.
-Vehicles and people taper upwards, so that only the upper half of an image counts.
+Without distortion they are straight lines through one vanishing point; distortion tilts them by their position. This
+gives the distortion, and whether the lens is a fisheye, but no focal length except that of a fisheye. Only the upper
+half of an image is used, since vehicles and people taper upwards.
 """
 
 from __future__ import annotations
