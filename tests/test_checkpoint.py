@@ -149,7 +149,7 @@ def test_parts_that_do_not_belong_together_are_refused() -> None:
         replace(begun, window=replace(begun.window, next_node=99)),
         replace(begun, factors=begun.factors | {LandmarkPoints.name: torn}),
     ):
-        with pytest.raises(CheckpointError, match="does not fit together"):
+        with pytest.raises(CheckpointError, match="is inconsistent"):
             PoseGraph.restore(pack(replace(whole, started=broken)), *SETTINGS["measured"])
     for lost in ({}, dict.fromkeys(begun.factors, b"")):
         with pytest.raises(CheckpointError, match="can't be read"):

@@ -1,4 +1,4 @@
-"""What an unsure camera height or focal length does to an estimate: all of its lengths are wrong by one factor."""
+"""The effect of an uncertain camera height or focal length: all lengths of an estimate share one factor."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ Curve = TypeVar("Curve", LaneLine, Lane)
 
 
 def with_camera_scale(estimate: Estimate, sigma_rel: float) -> Estimate:
-    """The estimate with covariances that have in them a common factor of 1 +- `sigma_rel` on all lengths.
+    """Returns the estimate with covariances that include a common factor of 1 +- `sigma_rel` on all lengths.
 
-    The factor is the same for all of a drive, so that no window averages it out: it scales the world about its origin,
-    and moves a pose p by sigma * p, a velocity v by sigma * v. Headings keep.
+    The factor is constant over a drive, so that no window averages it: it scales the world about its origin and changes
+    a position p by sigma * p, a velocity v by sigma * v. Headings do not change.
     """
     if not sigma_rel:
         return estimate
@@ -59,14 +59,14 @@ def _lanes(lanes: Lanes, sigma_rel: float) -> Lanes:
 
 
 def _curve(curve: Curve, sigma_rel: float) -> Curve:
-    """A factor on all lengths keeps a slope, and divides a curvature by itself and its rate by its square."""
+    """Slopes do not change, a curvature is divided by the factor and its rate by the square."""
     moved = (curve.offset_m, 0.0, -curve.curvature_per_m, -2.0 * curve.curvature_rate_per_m2)
     by_factor = (sigma_rel * sigma_rel * a * b for a in moved for b in moved)
     return msgspec.structs.replace(curve, cov=tuple(c + d for c, d in zip(curve.cov, by_factor, strict=True)))
 
 
 def _widened(cov: tuple[float, ...], pose: SE2, sigma_rel: float) -> tuple[float, ...]:
-    """Of a pose, row-major of its tangent, whose axes are the body's own."""
+    """Returns the covariance of a pose, row-major, in the axes of the body."""
     cos, sin = math.cos(pose.yaw_rad), math.sin(pose.yaw_rad)
     x_m = sigma_rel * (cos * pose.x_m + sin * pose.y_m)
     y_m = sigma_rel * (cos * pose.y_m - sin * pose.x_m)

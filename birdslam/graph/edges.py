@@ -11,7 +11,7 @@ from birdslam.geometry.arrays import Complexes, Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.types import EgoEdge, Measurements, MotionEdge, VehicleEdge
 
-LARGEST_M = 1e5  # an edge that is longer, or less certain, is no measurement
+LARGEST_M = 1e5  # maximum length and variance of a valid edge
 _MIN_COV = 1e-12
 
 
@@ -49,9 +49,9 @@ class VvEdges:
 
 
 def pose_edges(m: Measurements) -> PoseEdges:
-    """One CV and one VV edge for each vehicle (the last one counts).
+    """Returns one CV and one VV edge for each vehicle (the last one of the record).
 
-    What can't be a measurement is left out: a matrix that is no covariance, a length that is not of this world.
+    Invalid edges are left out: a matrix that is no covariance, or a length beyond LARGEST_M.
     """
     frame, cc = m.frame_id, m.cc
     cv = [*{e.vehicle: e for e in m.cv if e.frame == frame}.values()]
@@ -72,7 +72,7 @@ def _numbers(parts: list[tuple[float, ...]]) -> Floats:
 
 
 def _is_valid(T: SE2, cov: tuple[float, ...]) -> bool:
-    """Whether a pose of this world was measured, with a covariance: symmetric, without a negative eigenvalue."""
+    """Whether a pose is within LARGEST_M and its covariance symmetric and positive semidefinite."""
     if not (abs(T.x_m) <= LARGEST_M and abs(T.y_m) <= LARGEST_M and abs(T.yaw_rad) <= LARGEST_M):
         return False
     xx, xy, xt, yx, yy, yt, tx, ty, tt = cov

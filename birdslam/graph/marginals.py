@@ -1,8 +1,8 @@
-"""Marginal covariances in world: of the vehicles, with their poses and velocities, out of the window's P.
+"""Marginal poses, velocities and covariances of the vehicles in world, from the covariance P of the window.
 
-The error of a vehicle's size is the same in all frames, which P does not know. As a bias that is considered and not
-estimated (Schmidt 1966) it is added here: C + s^2 g g', g = (p, 0, v - v_ego), with s the edge's `depth_per_height`
-times `sigma_log_height`, p the vehicle's place from the ego and v its velocity; docs/method.md has the reasons.
+The error of a vehicle's size is common to all frames. It is a considered bias (Schmidt 1966) and is added here:
+C + s^2 g g', g = (p, 0, v - v_ego), with s the edge's `depth_per_height` times `sigma_log_height`, p the vehicle's
+position from the ego and v its velocity; docs/method.md has the derivation.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from birdslam.graph.vehicles import VehicleNode
 from birdslam.graph.window import Window
 from birdslam.types import Approach, VehicleEstimate
 
-# The Jacobian of a vehicle in world (place in its own axes, yaw, velocity) by (x, y, yaw) of the ego, of the vehicle in
-# ego, and of its twist: where each entry stands in a row of what `marginals_in_world` calls numbers
+# Jacobian of a vehicle in world (position in its own axes, yaw, velocity) by (x, y, yaw) of the ego, of the vehicle in
+# ego, and its twist: for each entry the row of `numbers` in `marginals_in_world`
 _JACOBIAN = np.array(
     [
         [2, 3, 5, 2, 3, 7, 9, 10, 12],
@@ -44,16 +44,16 @@ def vehicle_estimates(
     ego_mps: complex = 0j,
     birth_det: float | None = None,
 ) -> tuple[VehicleEstimate, ...]:
-    """Every vehicle at source time `t_ns`; one whose newest pose is older is driven on with the twist it had.
+    """Returns every vehicle at source time `t_ns`; older poses are predicted with their twist.
 
-    `changes` (3,): growth of a twist's variances per second. `ego_mps` is the ego's velocity in its own axes.
-    `birth_det`: the determinant of a velocity's covariance at birth, to judge by whether a vehicle stands
-    (standing.py); None: nobody judges.
+    `changes` (3,): growth of the variances of a twist per second. `ego_mps` is the ego's velocity in its own axes.
+    `birth_det`: determinant of the velocity covariance of a new vehicle, for the decision stationary or moving
+    (standing.py); None: no decision.
     """
     if not vehicles:
         return ()
     ahead_s = np.array([max((t_ns - v.node_ns) * 1e-9, 0.0) for v in vehicles])
-    sizes = np.array([v.size_bias_rel for v in vehicles])  # 1-sigma of each distance by its size, a fraction
+    sizes = np.array([v.size_bias_rel for v in vehicles])  # relative 1-sigma of each distance due to the size
     at, heading, velocities, covs = marginals_in_world(window, ahead_s, changes)
     covs += _of_sizes(window.world, ego_mps, sizes, at, heading, velocities)
     moving, moving_covs = velocities.view(np.float64).reshape(-1, 2), covs[:, 3:, 3:]
@@ -61,7 +61,7 @@ def vehicle_estimates(
         judge(vehicles, moving, moving_covs, birth_det, t_ns)
         moving, moving_covs = reported_velocities(vehicles, moving, moving_covs)
     near = _approaches(window, ego_mps, sizes, at, moving, moving_covs)
-    numbers = np.empty((len(vehicles), 18))  # of each record, in a row
+    numbers = np.empty((len(vehicles), 18))  # a row for each record
     numbers[:, 0], numbers[:, 1], numbers[:, 2] = at.real, at.imag, np.arctan2(heading.imag, heading.real)
     numbers[:, 3:5], numbers[:, 5:9] = moving, moving_covs.reshape(-1, 4)
     numbers[:, 9:].reshape(-1, 3, 3)[...] = covs[:, :3, :3]
@@ -93,7 +93,7 @@ def vehicle_estimates(
 def _approaches(
     window: Window, ego_mps: complex, sizes: Floats, at: Complexes, velocities: Floats, covs: Floats
 ) -> list[Approach]:
-    """Of each vehicle to the ego, in the ego's axes: without the ego's error in world, which both have.
+    """Returns the closest approach of each vehicle, computed in ego, where the ego's error in world cancels.
 
     `at` (M,), `velocities` (M, 2) and their `covs` (M, 2, 2) are in world; `sizes` (M,).
     """
@@ -110,7 +110,7 @@ def _approaches(
 def _of_sizes(
     world: SE2, ego_mps: complex, sizes: Floats, at: Complexes, heading: Complexes, velocities: Complexes
 ) -> Floats:
-    """(M, 5, 5), as the covariances of `marginals_in_world`: what errors of the vehicles' `sizes` (M,) add."""
+    """Returns the covariances (M, 5, 5) due to the errors of the vehicles' `sizes` (M,)."""
     ego, velocity_mps = complex(world.x_m, world.y_m), ego_mps * cmath.rect(1.0, world.yaw_rad)
     g = np.zeros((len(at), 5))
     away, closing = sizes * (at - ego) * heading.conj(), sizes * (velocities - velocity_mps)  # in the vehicle's axes
@@ -121,13 +121,15 @@ def _of_sizes(
 def marginals_in_world(
     window: Window, ahead_s: Floats, changes: Triple
 ) -> tuple[Complexes, Complexes, Complexes, Floats]:
-    """Vehicles in world, driven on by `ahead_s` (M,) past their newest pose: places, headings and velocities (M,) in
-    m/s, and the covariances (M, 5, 5) of pose and velocity. `changes` (3,): growth of the twists' variances per second.
+    """Returns the vehicles in world, predicted by `ahead_s` (M,) past their newest pose.
+
+    Positions, headings and velocities (M,) in m/s, and the covariances (M, 5, 5) of pose and velocity. `changes` (3,):
+    growth of the variances of the twists per second.
     """
     ego, origin, n = cmath.rect(1.0, window.world.yaw_rad), complex(window.world.x_m, window.world.y_m), window.nodes
     at, heading, velocities = window.at[n:], window.heading[n:], window.velocity
     late = ahead_s.any()
-    numbers = np.zeros((22, len(at)))  # a row for each that _JACOBIAN counts
+    numbers = np.zeros((22, len(at)))  # the rows of _JACOBIAN
     if late:
         way, heading, g, d = advance(heading, velocities, window.turn_radps, ahead_s)
         at = at + way
@@ -138,13 +140,13 @@ def marginals_in_world(
     back = heading.conj()  # to the vehicles' own axes
     in_world, lever = heading * ego, 1j * back * at
     velocities = velocities * in_world
-    # An error of the yaw turns the velocity, one of the twist adds to it
+    # A yaw error turns the velocity, a twist error adds to it
     x, y, c, s = -velocities.imag, velocities.real, in_world.real, in_world.imag
     numbers[1:7] = np.ones(len(at)), back.real, -back.imag, back.imag, lever.real, lever.imag
     numbers[15:20] = c, -s, s, x, y
     numbers[20:] = ahead_s * x, ahead_s * y
     J = numbers.T.take(_JACOBIAN, axis=1)
-    C = np.empty((len(at), 9, 9))  # of the ego in world and of each vehicle's own numbers
+    C = np.empty((len(at), 9, 9))  # of the ego in world and of each vehicle
     own = slice(0, TWIST.stop)
     C[:, :3, :3], C[:, 3:, :3] = window.ego_cov, window.with_egos[:, own, EGO]
     C[:, 3:, 3:] = window.each_vehicle[:, own, own]
@@ -153,5 +155,5 @@ def marginals_in_world(
         C.reshape(-1, 81)[:, 60::10] += np.outer(ahead_s, changes)
     covs: Floats = J @ C @ J.transpose(0, 2, 1)
     variances = covs.reshape(-1, 25)[:, ::6]
-    np.maximum(variances, 0.0, out=variances)  # where all is known, rounding has either sign
+    np.maximum(variances, 0.0, out=variances)  # rounding may make a zero variance negative
     return at * ego + origin, in_world, velocities, covs

@@ -1,4 +1,4 @@
-"""The minimum of Eq. 8: what the factors' edges in the newest frame say is put to what the window knows."""
+"""The minimum of Eq. 8: corrects the window by the linearized factors of the newest frame."""
 
 from __future__ import annotations
 
@@ -14,26 +14,25 @@ from birdslam.graph.factors.factor import Linearised
 from birdslam.graph.state_layout import EGO, LASTING, OF_VEHICLE, StateLayout, diagonal_blocks
 from birdslam.graph.window import Window
 
-_MIN_VARIANCE = 1e-8  # 0.1 mm, 0.1 mrad: edges more exact than that would cost the covariances their digits
-_LEFT_OUT = 1e12  # so uncertain an edge says nothing
+_MIN_VARIANCE = 1e-8  # (0.1 mm)^2, (0.1 mrad)^2: keeps the innovation covariance well-conditioned
+_LEFT_OUT = 1e12  # variance of an edge that is left out
 
 
 @functools.cache
 def solver() -> tuple[Any, Any]:
-    """LAPACK and BLAS for edges of all at once. They take 22 MB and a second to load: who needs them asks for them at
-    the start, the others never."""
+    """Returns LAPACK and BLAS. They take 22 MB and a second to load, and only `_all_at_once` needs them."""
     from scipy.linalg import blas, lapack
 
     return lapack, blas
 
 
 def minimise(window: Window, of_vehicles: Sequence[Linearised], terms: Sequence[Linearised], hold_ego: bool) -> None:
-    """The minimum of Eq. 8 over the edges of the newest frame, all at once, linearised at the prediction.
+    """Minimizes Eq. 8 over the edges of the newest frame, linearized at the prediction.
 
-    The edges `of_vehicles` leave the ego's poses where they are; `hold_ego` is of the newest pose alone and of the
-    other `terms`; lasting errors of vehicles' edges are held in all. What is held keeps its mean and covariance, and
-    its part in all others' uncertainty: it is considered, not estimated (Schmidt 1966). Notes in each term which of its
-    edges are outliers. Where the numbers leave all bounds, the window is not finite afterwards.
+    The edges `of_vehicles` do not correct the ego poses; with `hold_ego` the other `terms` do not correct the newest
+    one; lasting errors are never corrected. These states keep their mean and covariance, but their uncertainty counts
+    in all others: they are considered, not estimated (Schmidt 1966). Sets the `outliers` of each term. If a covariance
+    is not positive definite, the window is not finite afterwards.
     """
     try:
         if window.together:
@@ -44,20 +43,20 @@ def minimise(window: Window, of_vehicles: Sequence[Linearised], terms: Sequence[
         for term in of_vehicles:
             _each_vehicle(window, term, moved)
         _egos(window, terms, EGO if hold_ego else None)
-    except np.linalg.LinAlgError:  # no numbers of a road: something here is no covariance any more
+    except np.linalg.LinAlgError:  # some matrix is no covariance
         window.of_egos[:] = np.nan
 
 
 def _each_vehicle(window: Window, term: Linearised, moved: Floats) -> None:
-    """Edges that are each of one vehicle, which nothing ties to another: k systems of d equations, not one of k d.
+    """Applies edges of single, unconnected vehicles: k systems of d equations instead of one of k d.
 
-    `moved` (M, 6) is by how much the terms before have moved each vehicle since its edges were linearised.
+    `moved` (M, 8) is the sum of the corrections of each vehicle by earlier terms since the linearization.
     """
     if term.vehicles is None:
         raise ValueError("edges that leave the ego where it is are of single vehicles: `Linearised.vehicles`")
     rows: list[int] | slice = term.vehicles
     if rows == [*range(len(window.velocity))]:
-        rows = slice(None)  # without a copy
+        rows = slice(None)  # avoids a copy
     J, (k, d, _) = term.jacobian, term.covs.shape
     V, C, residual = window.of_vehicles[rows], window.with_egos[rows], np.reshape(term.residual, (k, d, 1))
     if isinstance(J, list):
@@ -85,7 +84,7 @@ def _each_vehicle(window: Window, term: Linearised, moved: Floats) -> None:
 
 
 def _egos(window: Window, terms: Sequence[Linearised], hold: slice | None) -> None:
-    """Edges of the ego's poses. What is relative to them goes with them, by what they have in common."""
+    """Applies edges of the ego poses; correlated states are corrected with them."""
     if not terms:
         return
     E, B = window.layout.ego_poses.stop, len(window.of_vehicles)
@@ -118,7 +117,7 @@ def _egos(window: Window, terms: Sequence[Linearised], hold: slice | None) -> No
 
 
 def _all_at_once(window: Window, terms: Sequence[Linearised], hold: slice) -> None:
-    """Edges of any part of the state, over P as one matrix."""
+    """Applies edges of any part of the state, with P as one matrix."""
     if not terms:
         return
     P, H = window.P, _jacobian(terms, window.layout)
@@ -150,7 +149,7 @@ def _residual(terms: Sequence[Linearised]) -> Floats:
 
 
 def _jacobian(terms: Sequence[Linearised], layout: StateLayout) -> list[int] | Floats:
-    """Of all terms, one below another, by the state (m, n); or, where all rows are unit vectors, by their numbers."""
+    """Returns the stacked Jacobian (m, n) of all terms; or, if all rows are unit vectors, their indices."""
     units = [_units(term.jacobian, term, layout) for term in terms if isinstance(term.jacobian, list)]
     if len(units) == len(terms):
         return [i for of_term in units for i in of_term]
@@ -170,7 +169,7 @@ def _jacobian(terms: Sequence[Linearised], layout: StateLayout) -> list[int] | F
 
 
 def _units(numbers: list[int], term: Linearised, layout: StateLayout) -> list[int]:
-    """The numbers of the state that those of a term are."""
+    """Returns the state indices of the indices of a term."""
     if term.vehicles is None:
         return numbers
     of_each: list[int] = layout.of_vehicles[term.vehicles][:, numbers].ravel().tolist()
@@ -178,7 +177,7 @@ def _units(numbers: list[int], term: Linearised, layout: StateLayout) -> list[in
 
 
 def _add_noise(S: Floats, terms: Sequence[Linearised]) -> None:
-    """Adds the edges' covariances to that of their residuals, `S`: of edges past their gate more than their own."""
+    """Adds the covariances of the edges to `S`, the covariance of their residuals; inflated beyond their gate."""
     placed, first = [], 0
     for term in terms:
         blocks = diagonal_blocks(S, first, term.covs.shape)
@@ -193,15 +192,15 @@ def _add_noise(S: Floats, terms: Sequence[Linearised]) -> None:
 
 
 def _inverses(covs: Floats) -> Floats:
-    """Of (k, d, d). Raises np.linalg.LinAlgError where one of them is no covariance."""
+    """Returns the inverses of (k, d, d). Raises np.linalg.LinAlgError if one is not positive definite."""
     np.linalg.cholesky(covs)
     return np.asarray(np.linalg.inv(covs), np.float64)
 
 
 def _inflate(blocks: Floats, term: Linearised, gate: float, distances: Floats) -> bool:
-    """Adds to the covariances (k, d, d) of residuals what edges past `gate` are less sure, and notes the outliers.
+    """Inflates the covariances (k, d, d) of residuals for edges beyond `gate`, and sets the outliers of the term.
 
-    Whether any is past it.
+    Returns whether any edge is beyond the gate.
     """
     term.outliers = []
     if distances.max() <= gate:

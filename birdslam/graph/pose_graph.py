@@ -49,18 +49,18 @@ from birdslam.types import (
     VehicleEstimate,
 )
 
-_STANDS = SE2()
-USUAL_CAMERA_M = 1.5  # over the road, where a record does not say
+_NO_MOTION = SE2()
+DEFAULT_CAMERA_HEIGHT_M = 1.5  # if a record does not state it
 _NO_PIXELS = frozenset({Status.END_OF_SOURCE, Status.FRAME_UNREADABLE, Status.COASTING})
 
 
 class PoseGraph:
-    """Bounded in time and memory; deterministic; raises nothing for what a record may say."""
+    """Deterministic, and bounded in time and memory; no content of a record raises an exception."""
 
     def __init__(
         self, config: GraphConfig, weights: WeightsConfig, epoch: int = 0, factors: Sequence[Factor] | None = None
     ) -> None:
-        """`factors`, which then belong to this graph, are `standard_factors(config, weights)` by default.
+        """`factors` default to `standard_factors(config, weights)`; this graph owns them.
 
         Raises ValueError as `check_together`, and for two factors of one name.
         """
@@ -68,7 +68,7 @@ class PoseGraph:
         self.weights = weights
         self.epoch = epoch
         self.factors = tuple(standard_factors(config, weights) if factors is None else factors)
-        self.outliers: dict[str, Sequence[int]] = {}  # of the newest frame: by a factor's name, which of its edges
+        self.outliers: dict[str, Sequence[int]] = {}  # of the newest frame: factor name -> indices of its edges
         self._predicting = [f for f in self.factors if type(f).predict is not Factor.predict]
         self._linearising = [f for f in self.factors if type(f).linearise is not Factor.linearise]
         self._concluding = [f for f in self.factors if type(f).conclude is not Factor.conclude]
@@ -78,21 +78,21 @@ class PoseGraph:
         self._map = PendingMap(config.max_pending_landmarks, config.max_pending_frames)
         self._twist_growth = twist_growth(config)
         self._birth = np.diag(np.square([config.birth_forward_mps, config.birth_sideways_mps, config.birth_turn_radps]))
-        # Whether a vehicle stands is judged by its velocity's covariance: Eq. 6 alone has none that was measured
+        # The decision stationary or moving needs a measured velocity covariance, which Eq. 6 alone does not have
         self._birth_det = float(self._birth[0, 0] * self._birth[1, 1]) if config.constant_velocity else None
-        self._camera_sigma_rel = 0.0  # of the last frame that said it
+        self._camera_sigma_rel = 0.0  # of the last frame that states one
         self._together = config.vehicles_move_ego or any(factor.ties_vehicles for factor in self.factors)
         if self._together:
             solver()
         self.window: Window | None = None  # None before the first frame
-        self._people: tuple[FollowedPerson, ...] = ()  # in the newest frame's ego
+        self._people: tuple[FollowedPerson, ...] = ()  # in the ego frame of the newest frame
         self._traffic = Traffic(stated(config.drives_on))
 
     def optimise(self, measurements: Measurements, records: Sequence[object] = ()) -> Estimate:
-        """One frame's edges in; the newest frame's poses, velocities and covariances out.
+        """Adds the edges of one frame and returns its poses, velocities and covariances.
 
-        `records` are the caller's own measurements at this frame, for factors that know their types. A frame that no CC
-        edge ties to a pose of the window begins a new epoch.
+        `records` are further measurements of this frame, for the caller's own factors. A frame without a CC edge to a
+        pose of the window begins a new epoch.
         """
         m = weighted(measurements, self.weights)  # Eq. 4
         self._camera_sigma_rel = m.camera_sigma_rel or self._camera_sigma_rel
@@ -111,7 +111,7 @@ class PoseGraph:
         for factor in self._concluding:
             factor.conclude(frame, window)
         self._map.add(m.frame_id, frame.settled, window.world, m.lanes)
-        if not window.is_finite:  # numbers that no road has: restart rather than publish them
+        if not window.is_finite:  # corrupt measurements: restart rather than publish
             window, reset = self._begin(m, True), True
         status = (*m.status, Status.GRAPH_RESET) if reset else m.status
         self._people = m.people
@@ -122,9 +122,9 @@ class PoseGraph:
         return with_camera_scale(estimate, self._camera_sigma_rel)
 
     def vehicles_in_ego(self) -> dict[BodyId, tuple[SE2, Floats]]:
-        """T_ego_vehicle with its covariance (3, 3) in ego, of the vehicles that the newest frame sees.
+        """Returns T_ego_vehicle with its covariance (3, 3) in ego, for the vehicles detected in the newest frame.
 
-        It has nothing of the ego's error in world, which the covariances of an estimate have.
+        Unlike the covariances of an estimate, it does not include the ego's error in world.
         """
         window, out = self.window, {}
         if window is None:
@@ -139,13 +139,13 @@ class PoseGraph:
         return out
 
     def map_update(self) -> MapUpdate | None:
-        """What the map gained since the last call, in world; None where it gained nothing."""
+        """Returns the additions to the map since the last call, in world; None if there are none."""
         return self._map.take()
 
-    # --- the life of the graph ---
+    # --- checkpoint, restore, restart ---
 
     def checkpoint(self) -> bytes:
-        """The graph as it stands between two frames, for `restore`."""
+        """Returns the state of the graph between two frames, for `restore`."""
         started = None
         if self.window is not None:
             started = Epoch(
@@ -162,16 +162,16 @@ class PoseGraph:
 
     @property
     def settings(self) -> dict[str, object]:
-        """All that a checkpoint has to agree in with the graph that goes on from it, plain."""
+        """The settings that a checkpoint and the restored graph must have in common."""
         return plain(graph=self.config, weights=self.weights) | {"factors": [factor.name for factor in self.factors]}
 
     @staticmethod
     def restore(
         data: bytes, config: GraphConfig, weights: WeightsConfig, factors: Sequence[Factor] | None = None
     ) -> PoseGraph:
-        """The graph of a `checkpoint`, which goes on with the very bytes that the one it was taken of would give.
+        """Returns the graph of a `checkpoint`; its further estimates equal those of the original graph, byte by byte.
 
-        Raises CheckpointError for bytes that are torn, that are no checkpoint, or that have other settings.
+        Raises CheckpointError for truncated data, for data of another kind, and for other settings.
         """
         graph = PoseGraph(config, weights, factors=factors)
         checkpoint = unpack(data, graph.settings)
@@ -187,9 +187,9 @@ class PoseGraph:
         except CheckpointError:
             raise
         except ValueError as error:
-            raise CheckpointError(f"does not fit together: {error}") from None
+            raise CheckpointError(f"is inconsistent: {error}") from None
         if len(started.vehicles) != len(graph.window.velocity):
-            raise CheckpointError(f"does not fit together: {len(started.vehicles)} vehicles are not the window's")
+            raise CheckpointError(f"is inconsistent: {len(started.vehicles)} vehicles, but not those of the window")
         graph._vehicles = VehicleNodes(config.forget_s, config.max_vehicles, config.detection_contradictions)
         graph._vehicles.resume(started.vehicles)
         graph._t_ns, graph._t_before_ns, graph._motion = started.t_ns, started.t_before_ns, started.motion
@@ -204,13 +204,13 @@ class PoseGraph:
         self._vehicles = VehicleNodes(config.forget_s, config.max_vehicles, config.detection_contradictions)
         for factor in self.factors:
             factor.begin()
-        self._t_ns = self._t_before_ns = m.t_source_ns  # of the newest pose and of the one before
+        self._t_ns = self._t_before_ns = m.t_source_ns  # of the newest pose and of the previous one
         self._motion = SE2()  # between them
         self._map.begin(self.epoch)
         return self.window
 
     def _follows(self, m: Measurements, window: Window, edges: PoseEdges) -> bool:
-        """Whether this frame's CC edge ties it to a pose of the window."""
+        """Whether the CC edge of this frame starts at a pose of the window."""
         cc = edges.cc
         return (
             cc is not None
@@ -222,23 +222,23 @@ class PoseGraph:
     # --- the steps of a frame ---
 
     def _associate(self, m: Measurements, edges: PoseEdges, records: Sequence[object]) -> GraphFrame:
-        """The frame with its edges to vehicles of the window."""
+        """Associates the edges of the frame with vehicles of the window."""
         associations = self._vehicles.associate(edges, m.frame_id, m.t_source_ns, self.config.constant_velocity)
         zero_velocity = self.config.zero_velocity_update and Status.STANDSTILL in m.status
         passed_s = max((m.t_source_ns - self._t_ns) * 1e-9, 0.0)
         return GraphFrame(m, edges, records, self._vehicles, associations, zero_velocity, passed_s)
 
     def _predict(self, frame: GraphFrame, window: Window) -> None:
-        """The window on to this frame."""
+        """Propagates the window to this frame."""
         for factor in self._predicting:
             factor.predict(frame, window)
         self._motion = frame.motion
         self._t_before_ns, self._t_ns = self._t_ns, frame.measurements.t_source_ns
 
     def _minimise(self, frame: GraphFrame, window: Window) -> None:
-        """Eq. 8 over this frame's edges."""
+        """Minimizes Eq. 8 over the edges of this frame."""
         terms: dict[str, Linearised] = {}
-        alone: list[Linearised] = []  # what leaves the ego where it is
+        alone: list[Linearised] = []  # terms that do not correct the ego
         joint: list[Linearised] = []
         for factor in self._linearising:
             term = factor.linearise(frame, window)
@@ -250,7 +250,7 @@ class PoseGraph:
         self.outliers = {name: term.outliers for name, term in terms.items()}
 
     def _update_vehicles(self, frame: GraphFrame, window: Window) -> None:
-        """Forgets who is long out of sight, and begins who is new or was an outlier too often."""
+        """Removes vehicles not seen for long, and adds new ones and those that were outliers too often."""
         m, cv, known = frame.measurements, frame.edges.cv, frame.associations.known
         outliers = [known[i] for i in self.outliers.get(VehicleDetections.name, ())]
         rows, started = self._vehicles.update(cv, known, outliers, m.t_source_ns)
@@ -263,9 +263,9 @@ class PoseGraph:
             window.place_vehicles(seen, self._birth_covs(seen.covs[:, 2, 2]), lasting, relative_sigmas(seen))
 
     def _birth_covs(self, yaw_variances: Floats) -> Floats:
-        """(k, 3, 3) of the twists of vehicles seen for the first time, at rest for all that is known.
+        """Returns the twist covariances (k, 3, 3) of new vehicles, whose mean twist is zero.
 
-        A yaw that is off turns the velocity: the twist is in axes that are off by it, so its variances grow by that.
+        The twist is expressed in axes with an uncertain yaw, which adds to its variances.
         """
         out = np.tile(self._birth, (len(yaw_variances), 1, 1))
         out[:, 0, 0] += yaw_variances * self._birth[1, 1]
@@ -275,9 +275,9 @@ class PoseGraph:
     # --- the newest frame's estimates ---
 
     def _coast(self, m: Measurements) -> Estimate:
-        """A frame without a picture: the last pose, as uncertain as the time since then makes it.
+        """Returns the estimate of a frame without an image: the last pose, with a covariance that grows with time.
 
-        One that nobody looked at is predicted by the last motion, which may have changed meanwhile.
+        A frame that was skipped (COASTING) is predicted with the last motion.
         """
         window, config = self.window, self.config
         if window is None:
@@ -298,12 +298,12 @@ class PoseGraph:
 
     @property
     def _ego_mps(self) -> complex:
-        """The ego's velocity in its own axes, of the last motion."""
+        """The ego's velocity in its own axes, from the last motion."""
         since_s = (self._t_ns - self._t_before_ns) * 1e-9
         return complex(self._motion.x_m, self._motion.y_m) / max(since_s, SHORTEST_S)
 
     def _lanes(self, lanes: Lanes, window: Window, vehicles: tuple[VehicleEstimate, ...]) -> Lanes:
-        """The front end's lanes, with who is in them."""
+        """Returns the lanes of the front end with the road users in them."""
         passed_s = max((self._t_ns - self._t_before_ns) * 1e-9, SHORTEST_S)
         users = lane_users(window, self._vehicles.nodes, vehicles, self._people)
         return with_users(lanes, users, self._motion.x_m / passed_s, self._traffic)
@@ -321,13 +321,13 @@ class PoseGraph:
         vehicles: tuple[VehicleEstimate, ...],
         ego_mps: complex = 0j,
         since_s: float = 0.0,
-        way: SE2 = _STANDS,
+        way: SE2 = _NO_MOTION,
     ) -> Estimate:
-        """`since_s` after the window's newest pose, from which the ego went on by `way`."""
+        """Builds the estimate `since_s` after the newest pose of the window; `way` is the ego's motion since then."""
         numbers = cov.ravel().tolist()
-        numbers[::4] = [max(variance, 0.0) for variance in numbers[::4]]  # where all is known, rounding has either sign
+        numbers[::4] = [max(variance, 0.0) for variance in numbers[::4]]  # rounding may make a zero variance negative
         before = SE2() if self.window is None else self.window.world
-        world = before if way is _STANDS else before @ way
+        world = before if way is _NO_MOTION else before @ way
         return Estimate(
             epoch=self.epoch,
             frame_id=m.frame_id,
@@ -344,5 +344,5 @@ class PoseGraph:
             status=tuple(dict.fromkeys(status)),
             speed_sources=m.speed_sources,
             people=people_estimates(self._people, since_s, before, cov, ego_mps, way),
-            hidden=hidden_fans(vehicles, world, USUAL_CAMERA_M if m.ground is None else m.ground.height_m),
+            hidden=hidden_fans(vehicles, world, DEFAULT_CAMERA_HEIGHT_M if m.ground is None else m.ground.height_m),
         )

@@ -1,9 +1,8 @@
-"""Whether vehicles stand or drive, and the velocity that planners are given of them.
+"""Decides whether vehicles are stationary or moving, and computes their reported velocity.
 
-Two estimates of how probably a vehicle stands, the front end's (vehicles/state/parallax.py) and the Savage-Dickey
-density ratio of the graph's velocity, are pooled by the mean of their log odds (Genest and Zidek 1986). From that comes
-a decision with hysteresis, and a velocity with the covariance of a mixture. docs/method.md ("Stationary or moving") has
-the equations and the reasons.
+Two probabilities of being stationary, that of the front end (vehicles/state/parallax.py) and the Savage-Dickey density
+ratio of the graph's velocity, are pooled by the mean of their log odds (Genest and Zidek 1986). The decision has
+hysteresis; the velocity has the covariance of a mixture. docs/method.md ("Stationary or moving") has the equations.
 """
 
 from __future__ import annotations
@@ -17,24 +16,20 @@ from birdslam.geometry.arrays import Floats
 from birdslam.graph.vehicles import VehicleNode
 from birdslam.types import Moves
 
-PRIOR = 1.0 / 3.0  # of the vehicles stand when first seen, as parallax.py has it
-# Of those first seen more than 15 m aside, on another road or on none. By the labels of KITTI tracking 0000 to 0020: 48
-# of 62 cars that do either, at their first sight of 25 px; nearer, but for the ego's own lane, it is 103 of 212
-PRIOR_BESIDE = 0.75
-MAX_PROBABILITY = 0.99  # and 1 less it: neither of the two is believed to be surer
-# To decide, and below it to give a decision up. By judgement; from 0.5 to 0.7 and from 0.9 to 0.95 the cars of KITTI
-# tracking 0000-0018 by RRC's boxes, and of 0005 by two networks', are decided alike but for some 10 sights of 5,600
-DECIDED, GIVEN_UP = 0.9, 0.7
-STANDING_MPS = 0.05  # 1-sigma of the velocity of what stands, as of the final trajectories
+PRIOR = 1.0 / 3.0  # probability that a new vehicle is stationary, as in parallax.py
+PRIOR_BESIDE = 0.75  # the same for vehicles first seen more than 15 m aside: 48 of 62 labelled cars of KITTI tracking
+MAX_PROBABILITY = 0.99  # limit of either probability, and 1 minus it
+DECIDED, GIVEN_UP = 0.9, 0.7  # probabilities at which a decision is made, and revoked; by judgement
+STANDING_MPS = 0.05  # 1-sigma of the velocity of a stationary vehicle
 _MIN_DET = 1e-12  # of a velocity's covariance, (m/s)^4
 _SHARE = {Moves.STANDING: 1.0, Moves.DRIVING: 0.0}
 
 
 def judge(vehicles: Sequence[VehicleNode], velocities: Floats, covs: Floats, birth_det: float, t_ns: int) -> None:
-    """Renews `standing` and `moves` of the vehicles of which this frame, at source time `t_ns`, has edges.
+    """Updates `standing` and `moves` of the vehicles that have an edge in this frame, at source time `t_ns`.
 
-    `velocities` (M, 2) in m/s with `covs` (M, 2, 2) are the graph's; `birth_det` is the determinant of such a
-    covariance at birth.
+    `velocities` (M, 2) in m/s with `covs` (M, 2, 2) come from the graph; `birth_det` is the determinant of such a
+    covariance for a new vehicle.
     """
     rows = [row for row, v in enumerate(vehicles) if v.seen_ns == t_ns and v.standing_seen is not None]
     if not rows:
@@ -45,7 +40,7 @@ def judge(vehicles: Sequence[VehicleNode], velocities: Floats, covs: Floats, bir
     z2 = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / det
     by_velocity = _clipped(_logit(PRIOR) + 0.5 * (np.log(birth_det / det) - z2))
     seen = np.array([vehicles[row].standing_seen for row in rows], np.float64)
-    # Both have the prior of those on its road
+    # Both probabilities assume PRIOR
     beside = np.array([vehicles[row].beside for row in rows]) * (_logit(PRIOR_BESIDE) - _logit(PRIOR))
     pooled = _probability((by_velocity + _clipped(_logit(seen))) / 2.0 + beside)
     alone = _probability(by_velocity)
@@ -53,14 +48,14 @@ def judge(vehicles: Sequence[VehicleNode], velocities: Floats, covs: Floats, bir
         v = vehicles[row]
         if not v.in_path:
             v.standing, v.moves = standing, decide(v.moves, standing)
-        elif standing <= 1.0 - DECIDED:  # no size and no tilt let what stands come nearer so slowly
+        elif standing <= 1.0 - DECIDED:  # an error of size or tilt can't explain the slow approach
             v.standing, v.moves = standing, Moves.DRIVING
         elif v.moves is not Moves.DRIVING and by_velocity_alone <= 1.0 - DECIDED:
             v.standing, v.moves = None, Moves.UNDECIDED
 
 
 def decide(before: Moves, standing: float) -> Moves:
-    """The decision after the one `before`, from the probability that it stands."""
+    """Returns the decision after `before`, given the probability of being stationary."""
     if standing >= DECIDED:
         return Moves.STANDING
     if standing <= 1.0 - DECIDED:
@@ -70,10 +65,10 @@ def decide(before: Moves, standing: float) -> Moves:
 
 
 def reported_velocities(vehicles: Sequence[VehicleNode], velocities: Floats, covs: Floats) -> tuple[Floats, Floats]:
-    """Velocities u (M, 2) in m/s and their covariances (M, 2, 2), from the graph's, which are of vehicles that move.
+    """Returns velocities u (M, 2) in m/s with covariances (M, 2, 2), from those of the graph, which assume motion.
 
-    x = 0 with the probability p of standing, else N(v, P); u = (1 - w) v, and the covariance is
-    (1 - p) P + ((1 - p) w^2 + p (1 - w)^2) v v' + p sigma^2 I; w is 1 when standing, 0 when driving, else p.
+    The velocity is 0 with the probability p of being stationary, else N(v, P); u = (1 - w) v, and the covariance is
+    (1 - p) P + ((1 - p) w^2 + p (1 - w)^2) v v' + p sigma^2 I; w is 1 if stationary, 0 if moving, else p.
     """
     stands = [v.standing or 0.0 for v in vehicles]
     p = np.array(stands)

@@ -1,4 +1,4 @@
-"""The vehicles of the pose graph: which are in it, which edges tie them to it, and which detections are outliers."""
+"""The vehicles of the pose graph: their bookkeeping, data association, addition and removal."""
 
 from __future__ import annotations
 
@@ -15,48 +15,48 @@ from birdslam.graph.factors.lasting_error import sight_factors
 from birdslam.types import Moves, VehicleEdge
 
 PATH_HALF_WIDTH_M = 1.75  # half a lane, as in vehicles/state/parallax.py
-BESIDE_M = 15.0  # farther aside is another road, or none: see standing.py
-MAX_LOG_HEIGHT = 2.0  # of what is no vehicle
-SHORTEST_S = 1e-3  # source clocks that stand still or run backwards
+BESIDE_M = 15.0  # vehicles at a larger lateral distance are on another road or parked: standing.py
+MAX_LOG_HEIGHT = 2.0  # of a vehicle
+SHORTEST_S = 1e-3  # minimum interval, for source clocks that stop or step back
 
 
 @dataclass(slots=True)
 class VehicleNode:
-    """One vehicle; its pose and velocity are the window's, in the row at which it stands in `VehicleNodes.nodes`."""
+    """One vehicle. Its index in `VehicleNodes.nodes` is its row in the window, which has its pose and twist."""
 
     vehicle: int
-    node_frame: int = -1  # of its newest pose
+    node_frame: int = -1  # frame of its newest pose
     node_ns: int = 0
     seen_ns: int = 0
-    frames: int = 0  # that it was seen in
-    agreed: int = 0  # detections that fitted since it was last begun
-    contradicted: int = 0  # outliers in a row
+    frames: int = 0  # number of frames with a detection
+    agreed: int = 0  # inliers since it was added or restarted
+    contradicted: int = 0  # consecutive outliers
     label: str = "car"
     length_m: float = 0.0
     width_m: float = 0.0
-    delay_ns: int = 0  # of the detection at seen_ns
-    standing_seen: float | None = None  # the probability that it stands, by its last edge; None: that did not say
-    in_path: bool = False  # of the ego, by its last edge
-    beside: bool = False  # on another road, or on none, by its first edge
-    size_bias_rel: float = 0.0  # 1-sigma of its distance by its size's error, a fraction: the same in all frames
-    standing: float | None = None  # the probability by all that is known; None: of that nothing
+    delay_ns: int = 0  # delay of the detection at seen_ns
+    standing_seen: float | None = None  # probability of being stationary, from the last edge; None: not stated
+    in_path: bool = False  # in the ego's path, by its last edge
+    beside: bool = False  # farther aside than BESIDE_M at its first edge
+    size_bias_rel: float = 0.0  # relative 1-sigma of its distance due to its size, common to all frames
+    standing: float | None = None  # probability of being stationary, from all evidence; None: no evidence
     moves: Moves = Moves.UNDECIDED
-    height_m: float = 0.0  # 0: not known
+    height_m: float = 0.0  # 0: unknown
     sigma_height_m: float = 0.0
 
 
 @dataclass(slots=True)
 class Associations:
-    """The edges of a frame to vehicles of the window, and for how long each vehicle drives on."""
+    """The edges of a frame to vehicles of the window, and the interval over which each vehicle is predicted."""
 
-    known: list[int]  # which of the frame's CV edges `cv` has
+    known: list[int]  # indices of the frame's CV edges in `cv`
     cv: CvEdges
     vv: VvEdges
-    dt_s: Floats  # (M,) since each vehicle's newest pose; 0: it gets no pose in this frame
+    dt_s: Floats  # (M,) since each vehicle's newest pose; 0: no pose in this frame
 
 
 def cv_edges(rows: list[int], numbers: Floats) -> CvEdges:
-    """The edges to the vehicles in these rows of the window, all in ego, from their `numbers` (k, 12)."""
+    """Returns the edges, in ego, to the vehicles in these rows of the window, from their `numbers` (k, 12)."""
     at, heading = numbers[:, 0] + 1j * numbers[:, 1], np.exp(1j * numbers[:, 2])
     covs = rotated(numbers[:, 3:].reshape(-1, 3, 3), heading)
     return CvEdges(rows, at, heading, covs, sight_factors(at, covs))
@@ -77,15 +77,15 @@ class VehicleNodes:
         self._row: dict[int, int] = {}
 
     def resume(self, nodes: list[VehicleNode]) -> None:
-        """Goes on with the vehicles of an earlier process, in the order of the window's rows."""
+        """Restores the vehicles of a checkpoint, in the order of the rows of the window."""
         self.nodes = nodes
         self._row = {v.vehicle: row for row, v in enumerate(nodes)}
 
     def associate(self, edges: PoseEdges, frame: int, t_ns: int, constant_velocity: bool) -> Associations:
-        """Which edges of the frame have both ends in the window; each vehicle that they reach gets a pose there.
+        """Selects the edges of the frame to vehicles of the window; each of these vehicles gets a pose in this frame.
 
-        A VV edge has to start at the vehicle's newest pose. Without `constant_velocity` nothing but a VV edge ties a
-        vehicle's new pose to the one before (Eq. 6).
+        A VV edge must start at the newest pose of its vehicle. Without `constant_velocity` only a VV edge connects
+        consecutive poses of a vehicle (Eq. 6).
         """
         rows = [self._row.get(e.vehicle, -1) for e in edges.cv]
         known = [k for k, row in enumerate(rows) if row >= 0]
@@ -114,19 +114,18 @@ class VehicleNodes:
         return Associations(known, cv, vv, dt_s)
 
     def row(self, vehicle: int) -> int:
-        """Of a vehicle in the window; -1: it is not there."""
+        """Returns the row of a vehicle in the window; -1 if there is none."""
         return self._row.get(vehicle, -1)
 
     def update(
         self, edges: list[VehicleEdge], known: list[int], outliers: list[int], t_ns: int
     ) -> tuple[list[int] | None, list[int]]:
-        """Takes up what this frame's CV edges say of vehicles, and forgets who is long out of sight.
+        """Updates the vehicles by the CV edges of this frame, and removes those not seen for `forget_s`.
 
-        Of the edges, `known` are those that corrected a vehicle or, being `outliers`, contradicted it and were left
-        out. Returns the rows that stay, in their new order, -1 for a vehicle that is new (None: all stay and none is
-        new), and which edges begin a vehicle: one that nothing ties to an earlier pose, or one that was contradicted in
-        a row as often as it had been agreed with before (or often enough), so that a vehicle that began with an outlier
-        soon ends.
+        `known` are the edges to vehicles of the window, `outliers` those of them that were rejected. Returns the rows
+        that are kept, in their new order, with -1 for a new vehicle (None: no change), and the edges that start or
+        restart a vehicle. A vehicle restarts after as many consecutive outliers as it had inliers before, or after
+        `contradictions`, so that a track that started with an outlier ends soon.
         """
         born = []
         started = [k for k in range(len(edges)) if k not in known] if len(known) < len(edges) else []
@@ -144,7 +143,7 @@ class VehicleNodes:
                     started.append(k)
             v.seen_ns, v.frames, v.label = t_ns, v.frames + 1, edge.label
             v.length_m, v.width_m, v.delay_ns = edge.length_m, edge.width_m, edge.delay_ns
-            v.standing_seen = edge.standing or None  # 0: nobody said
+            v.standing_seen = edge.standing or None  # 0: not stated
             v.size_bias_rel = abs(edge.depth_per_height) * edge.sigma_log_height
             if edge.sigma_log_height > 0.0:
                 v.height_m = math.exp(min(edge.log_height, MAX_LOG_HEIGHT))
@@ -156,7 +155,7 @@ class VehicleNodes:
             return None, started
         everyone = [*self.nodes, *born]
         rows = [*alive, *range(before, len(everyone))]
-        if len(rows) > self._capacity:  # the freshest stay, the first of them first
+        if len(rows) > self._capacity:  # keep those seen last
             rows = sorted(sorted(rows, key=lambda row: (-everyone[row].seen_ns, row))[: self._capacity])
         self.nodes = [everyone[row] for row in rows]
         self._row = {v.vehicle: row for row, v in enumerate(self.nodes)}
@@ -164,7 +163,7 @@ class VehicleNodes:
         return [row if row < before else -1 for row in rows], started
 
     def begin(self, vehicle: int, frame: int, t_ns: int) -> int:
-        """The row of a vehicle whose first pose is in this frame."""
+        """Starts a vehicle at this frame and returns its row."""
         row = self._row[vehicle]
         v = self.nodes[row]
         v.node_frame, v.node_ns, v.agreed, v.contradicted = frame, t_ns, 1, 0

@@ -1,9 +1,9 @@
-"""The window of the pose graph: the joint Gaussian of the newest poses, moved on once a frame.
+"""The sliding window of the pose graph: the joint Gaussian of the newest poses, propagated once a frame.
 
-It has the newest ego pose in the world, a few ego poses before it, each vehicle's newest pose and its twist. Poses that
-leave it are marginalised: in covariance form their rows are dropped, which is exact. All poses but the first are
-*relative to the newest ego*, and so are their errors, in its axes; docs/method.md ("The window") has the state, its
-charts and the reasons. Positions are complex numbers x + iy in metres and headings unit complex numbers e^(i yaw).
+Its state is the newest ego pose in world, a few earlier ego poses, and the newest pose and twist of each vehicle. Older
+poses are marginalized: in covariance form their rows are dropped, which is exact. All poses but the first, and their
+errors, are *relative to the newest ego*; docs/method.md ("The window") has the state and its charts. Positions are
+complex numbers x + iy in metres and headings unit complex numbers e^(i yaw).
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from birdslam.geometry.se2 import SE2
 from birdslam.graph.edges import CvEdges
 from birdslam.graph.state_layout import EGO, LASTING, OF_VEHICLE, POSE, TWIST, StateLayout
 
-KEY_NODE = 0  # the ego node that landmarks are tied to; it is renewed once in every round of the nodes
+KEY_NODE = 0  # the ego node to which landmarks are anchored; it is replaced once in `nodes` frames
 KEY_PLACE = [3 * KEY_NODE + 3, 3 * KEY_NODE + 4]  # the rows of its place
 EGO_PLACE = [0, 1]
-PLACE = slice(POSE.start, POSE.start + 2)  # of a vehicle's own numbers
+PLACE = slice(POSE.start, POSE.start + 2)  # position, of the state of a vehicle
 
 
 class WindowState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """All that a window holds; see there."""
+    """The state of a `Window`, for checkpoints."""
 
     frame: int
     node_frames: list[int | None]
@@ -47,18 +47,18 @@ class WindowState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
 
 class Window:
-    """The joint Gaussian of one epoch, which begins at `frame`. `nodes` ego poses are kept beside the newest.
+    """The joint Gaussian of one epoch, which begins at `frame`, with `nodes` earlier ego poses.
 
-    The covariance P is kept in the three parts that a frame works on: of the ego's poses, of vehicles with these, and
-    of vehicles. `together`: edges tie vehicles, and the last is one block. Else each vehicle has its own, and what two
-    of them have in common is not kept: nothing reads it. docs/method.md ("Vehicles and the ego") says what that is.
+    The covariance P is stored in three parts: ego poses, vehicles with ego poses, and vehicles. If `together`, edges
+    connect vehicles, and the last part is one block. Else it has a block for each vehicle, without the correlation
+    between vehicles, which nothing reads: docs/method.md ("Vehicles and the ego").
     """
 
     def __init__(self, nodes: int, frame: int, together: bool = False) -> None:
         self.nodes = nodes
         self.frame = frame
         self.node_frames: list[int | None] = [None] * nodes
-        self.next_node = 0  # where the newest ego pose goes when the ego moves on
+        self.next_node = 0  # the node that the newest ego pose replaces in the next frame
         self.world = SE2()  # T_world_ego
         # Poses in ego, of the ego nodes and then the vehicles; twists of the vehicles
         self.at = np.zeros(nodes, np.complex128)
@@ -75,12 +75,12 @@ class Window:
         self.of_vehicles = np.zeros((1, 0, 0) if together else (0, OF_VEHICLE, OF_VEHICLE))
 
     def state(self) -> WindowState:
-        """For `from_state`; its arrays are the window's own."""
+        """Returns the state for `from_state`, without a copy of the arrays."""
         return WindowState(**{name: getattr(self, name) for name in WindowState.__struct_fields__})
 
     @staticmethod
     def from_state(state: WindowState, together: bool) -> Window:
-        """The window that had this state. Raises ValueError where its arrays do not belong together."""
+        """Returns the window of this state. Raises ValueError for inconsistent shapes."""
         nodes, M = len(state.node_frames), len(state.velocity)
         layout, window = StateLayout.of(nodes, M), Window(nodes, state.frame, together)
         E, n = layout.ego_poses.stop, OF_VEHICLE * M
@@ -95,7 +95,7 @@ class Window:
         window.layout = layout
         return window
 
-    # --- what is known ---
+    # --- read access ---
 
     @property
     def ego_cov(self) -> Floats:
@@ -104,7 +104,7 @@ class Window:
 
     @property
     def each_vehicle(self) -> Floats:
-        """(M, 8, 8) of the vehicles' own numbers."""
+        """Covariances (M, 8, 8) of the vehicles' states."""
         if not self.together:
             return self.of_vehicles
         M = len(self.velocity)
@@ -112,13 +112,13 @@ class Window:
 
     @property
     def _variances(self) -> Floats:
-        """(M, 8) of the vehicles' own numbers, a view."""
+        """Variances (M, 8) of the vehicles' states, a view."""
         B, n, _ = self.of_vehicles.shape
         return self.of_vehicles.reshape(B, n * n)[:, :: n + 1].reshape(-1, OF_VEHICLE)
 
     @property
     def P(self) -> Floats:
-        """(n, n) a copy of all as one matrix; without `together` vehicles have nothing in common in it."""
+        """A copy (n, n) of the whole covariance; without `together`, zero between vehicles."""
         n = self.layout.ego_poses.stop
         P = np.zeros((self.layout.size, self.layout.size))
         P[:n, :n] = self.of_egos
@@ -132,7 +132,7 @@ class Window:
         return P
 
     def set_P(self, P: Floats) -> None:
-        """All of it, of vehicles that are together."""
+        """Sets the whole covariance of a window with `together`."""
         n = self.layout.ego_poses.stop
         self.of_egos = P[:n, :n].copy()
         self.with_egos = P[n:, :n].copy().reshape(-1, OF_VEHICLE, n)
@@ -140,24 +140,24 @@ class Window:
 
     @property
     def is_finite(self) -> bool:
-        """False: numbers that no road has, and the window is of no more use."""
+        """Whether all variances are finite; else the window must be restarted."""
         return math.isfinite(self.of_egos.trace() + self._variances.sum())
 
     @property
     def is_keyframe(self) -> bool:
-        """Whether the newest ego pose is going to be the key node: one frame in `nodes`."""
+        """Whether the newest ego pose becomes the key node: one frame in `nodes`."""
         return self.next_node == KEY_NODE
 
     def key_node(self) -> tuple[complex, complex, Floats]:
-        """The key node's place and heading in ego, and the covariance (2, 2) of its place."""
+        """Returns position and heading of the key node in ego, and the covariance (2, 2) of its position."""
         rows = StateLayout.node(KEY_NODE)
         return complex(self.at[KEY_NODE]), complex(self.heading[KEY_NODE]), self.of_egos[rows, rows][:2, :2]
 
     def has_pose(self, frame: int) -> bool:
-        """Whether a CC edge can start at `frame`: the newest, or a node that the newest will not take the place of."""
+        """Whether a CC edge can start at `frame`: the newest pose, or a node that it does not replace."""
         return frame == self.frame or (frame in self.node_frames and frame != self.node_frames[self.next_node])
 
-    # --- from frame to frame ---
+    # --- propagation ---
 
     def propagate(
         self,
@@ -168,21 +168,21 @@ class Window:
         dt_s: Floats,
         twist_growth: Sequence[float],
     ) -> SE2:
-        """The ego goes by `motion` with `cov` (3, 3) since the known frame `from_frame`: the CC edge of Eq. 2.
+        """Propagates the ego by `motion` with `cov` (3, 3) from the frame `from_frame`: the CC edge of Eq. 2.
 
-        Each vehicle drives on for its `dt_s` (M,) with the twist it has, whose variances grow by `twist_growth` (3,)
-        a second: the constant-velocity factor. A vehicle with `dt_s` 0 stays at the pose it was last seen at. Returns
-        how far the ego went since the newest frame.
+        Each vehicle is propagated over `dt_s` (M,) with its twist, whose variances grow by `twist_growth` (3,) per
+        second: the constant-velocity factor. A vehicle with `dt_s` 0 keeps its pose. Returns the ego's motion since the
+        newest frame.
         """
         node = self._replace_oldest_node()
         base = self.node_frames.index(from_frame)
         T_ego_next = motion if base == node else _se2(self.at[base], self.heading[base]) @ motion
-        self.world = self.world @ T_ego_next  # Eq. 2, of a CC edge with the residual zero
+        self.world = self.world @ T_ego_next  # Eq. 2 with residual zero
         back = cmath.rect(1.0, -T_ego_next.yaw_rad)
         F = self._move_poses(T_ego_next, back, dt_s)
         if any(twist_growth) and len(dt_s):
             self._variances[:, TWIST] += np.outer(dt_s, twist_growth)
-        if node == 0:  # now and then, so that rounding can't add up
+        if node == 0:  # once in `nodes` frames, against the accumulation of rounding errors
             self.of_egos = 0.5 * (self.of_egos + self.of_egos.T)
             self.of_vehicles = 0.5 * (self.of_vehicles + self.of_vehicles.transpose(0, 2, 1))
             self.heading /= np.abs(self.heading)
@@ -192,19 +192,19 @@ class Window:
         return T_ego_next
 
     def _replace_oldest_node(self) -> int:
-        """The newest ego pose takes the place of the oldest node, which is marginalised; which node that is."""
+        """Replaces the oldest node, which is marginalized, by the newest ego pose; returns the index of the node."""
         node = self.next_node
         rows = StateLayout.node(node)
-        self.at[node], self.heading[node] = 0j, 1.0 + 0j  # relative to the newest ego pose, which it still is itself
-        self.of_egos[rows] = self.of_egos[:, rows] = 0.0  # and so without error
+        self.at[node], self.heading[node] = 0j, 1.0 + 0j  # relative to the newest ego pose, which is the same
+        self.of_egos[rows] = self.of_egos[:, rows] = 0.0  # without error
         self.with_egos[:, :, rows] = 0.0
         self.node_frames[node] = self.frame
         return node
 
     def _move_poses(self, T_ego_next: SE2, back: complex, dt_s: Floats) -> Floats:
-        """All poses, relative to the next ego pose, whose axes are turned by `back`; vehicles drive on.
+        """Expresses all poses relative to the next ego pose, whose axes are turned by `back`, and propagates vehicles.
 
-        Returns (M, 8, 8) how the errors of a vehicle's pose and twist move.
+        Returns the transition matrices (M, 8, 8) of the vehicles' errors.
         """
         self.at = (self.at - complex(T_ego_next.x_m, T_ego_next.y_m)) * back
         self.heading = self.heading * back
@@ -222,7 +222,7 @@ class Window:
         return F
 
     def _move_errors(self, T_ego_next: SE2, back: complex, F: Floats) -> None:
-        """P of the moved poses: J P J', where J is block-diagonal."""
+        """Propagates P: J P J' with a block-diagonal J."""
         T, c, s = T_ego_next.inverse(), back.real, back.imag
         J = np.array((0.0, 1.0, c, s, -s, T.y_m, -T.x_m)).take(self.layout.ego_moves)
         self.of_egos = J @ self.of_egos @ J.T
@@ -237,9 +237,9 @@ class Window:
         self.of_vehicles = np.ascontiguousarray(self.of_vehicles)
 
     def _add_motion_noise(self, cov: Floats, base: int | None) -> None:
-        """The noise of the ego's motion `cov` (3, 3) moves all that is relative to the ego.
+        """Adds the noise `cov` (3, 3) of the ego's motion to all states relative to the ego.
 
-        So does, where the motion did not start at the newest pose but at the node `base`, the error of that node.
+        If the motion starts at the node `base` instead of the newest pose, the error of that node is added too.
         """
         layout, n, (B, size, _) = self.layout, self.nodes, self.of_vehicles.shape
         G, G_vehicles = layout.egos_against.copy(), layout.vehicles_against.copy()
@@ -266,43 +266,41 @@ class Window:
                 self.of_vehicles += noise.reshape(B, size, 3) @ blocks.transpose(0, 2, 1)
 
     def drift(self, along: complex, variance: float, across_variance: float) -> None:
-        """The ego, and with it all that is relative to it, may have come this much further in the world than its edge
-        says.
+        """Adds variances (m^2) along and across the unit vector `along` in ego to the position of the ego in world.
 
-        `along` is the direction in ego, of length 1, the variances along it and across it are in m^2. Between what is
-        in sight nothing changes.
+        Poses relative to the ego do not change.
         """
         c, s = along.real, along.imag
         self.of_egos[:2, :2] += variance * np.outer((c, s), (c, s)) + across_variance * np.outer((-s, c), (-s, c))
 
     def turn_drift(self, variance: float) -> None:
-        """The ego, and with it all that is relative to it, may have turned this much more in the world (rad^2)."""
+        """Adds a variance (rad^2) to the yaw of the ego in world."""
         self.of_egos[2, 2] += variance
 
     # --- corrections ---
 
     def shift_egos(self, dx: Floats) -> None:
-        """Moves the means of the ego's poses by `dx` (E,)."""
+        """Adds `dx` (E,) to the ego poses."""
         self.world = self.world @ SE2(*dx[:3].tolist())
         n = self.nodes
         self.at[:n] += dx[3::3] + 1j * dx[4::3]
         self.heading[:n] *= np.exp(1j * dx[5::3])
 
     def shift_vehicles(self, rows: Sequence[int] | slice, dx: Floats) -> None:
-        """Moves the means of vehicles `rows` (k,), each once, by `dx` (k, 8), of which a lasting error has none."""
+        """Adds `dx` (k, 8) to the means of vehicles `rows` (k,), each listed once."""
         self.at[self.nodes :][rows] += dx[:, 0] + 1j * dx[:, 1]
         self.heading[self.nodes :][rows] *= np.exp(1j * dx[:, 2])
         self.velocity[rows] += dx[:, 3] + 1j * dx[:, 4]
         self.turn_radps[rows] += dx[:, 5]
 
     def shift(self, dx: Floats) -> None:
-        """Moves all means by `dx` (n,)."""
+        """Adds `dx` (n,) to all means."""
         n = self.layout.ego_poses.stop
         self.shift_egos(dx[:n])
         self.shift_vehicles(slice(None), dx[n:].reshape(-1, OF_VEHICLE))
 
     def flip_headings(self, rows: Sequence[int]) -> None:
-        """Vehicles `rows` (k,) have their front where their back was, and move as before: front and back look alike."""
+        """Turns vehicles `rows` (k,) by 180 degrees with an unchanged velocity: front and rear look alike."""
         sign = np.ones((len(self.velocity), OF_VEHICLE))
         sign[rows, TWIST.start : TWIST.start + 2] = -1.0
         self.with_egos *= sign[:, :, None]
@@ -311,22 +309,22 @@ class Window:
         self.heading[self.nodes :][rows] *= -1.0
         self.velocity[rows] *= -1.0
 
-    # --- vehicles come and go ---
+    # --- addition and removal of vehicles ---
 
     def place_vehicles(self, seen: CvEdges, twist_covs: Floats, lasting: Floats, sigma_rel: Floats) -> None:
-        """Vehicles restart where they are seen, at rest give or take, independent of all else.
+        """Starts vehicles at their detections with zero twist, uncorrelated with all other states.
 
-        `lasting` (k, 2, 2) and `sigma_rel` (k, 2) are of their edges; see lasting_error.py.
+        `lasting` (k, 2, 2) and `sigma_rel` (k, 2) belong to their edges: lasting_error.py.
         """
         self.at[self.nodes :][seen.rows], self.heading[self.nodes :][seen.rows] = seen.at, seen.heading
         self._renew(seen.rows, POSE, seen.covs)
         self.set_twists(seen.rows, np.zeros(len(seen.rows)), np.zeros(len(seen.rows)), twist_covs)
         self._renew(seen.rows, LASTING, np.eye(2))
-        self._relate(seen.rows, PLACE, LASTING, -lasting)  # where they are is the edge less its error
+        self._relate(seen.rows, PLACE, LASTING, -lasting)  # the position is the edge minus its error
         self.sigma_rel[seen.rows] = sigma_rel
 
     def fade_lasting(self, rows: Sequence[int], kept: Floats, sigma_rel: Floats) -> None:
-        """The lasting errors of vehicles `rows` (k,) are by `kept` (k, 2) those of their last edges, the rest new."""
+        """Keeps the fraction `kept` (k, 2) of the lasting errors of vehicles `rows` (k,); the rest is new."""
         factor = np.ones((len(self.velocity), OF_VEHICLE))
         factor[rows, LASTING] = kept
         own = factor.reshape(self.of_vehicles.shape[:2])
@@ -336,12 +334,12 @@ class Window:
         self.sigma_rel[rows] = sigma_rel
 
     def set_twists(self, rows: Sequence[int], velocity: Complexes | Floats, turn_radps: Floats, covs: Floats) -> None:
-        """Vehicles `rows` (k,) get new twists with `covs` (k, 3, 3), independent of all else; their poses stay."""
+        """Sets the twists of vehicles `rows` (k,) with `covs` (k, 3, 3), uncorrelated with all other states."""
         self.velocity[rows], self.turn_radps[rows] = velocity, turn_radps
         self._renew(rows, TWIST, covs)
 
     def _renew(self, rows: Sequence[int], numbers: slice, covs: Floats) -> None:
-        """These n numbers of each vehicle get their covariance (k, n, n), and no correlation with others."""
+        """Sets the covariance (k, n, n) of these states of each vehicle, without correlations."""
         self.with_egos[rows, numbers] = 0.0
         V, block, within = self._by_vehicle(rows)
         V[block, within, numbers] = 0.0
@@ -349,19 +347,19 @@ class Window:
         V[block, within, numbers, within, numbers] = covs
 
     def _relate(self, rows: Sequence[int], numbers: slice, others: slice, covs: Floats) -> None:
-        """Numbers of each vehicle get these covariances (k, n, m) with other numbers of it."""
+        """Sets the covariances (k, n, m) between two groups of states of each vehicle."""
         V, block, within = self._by_vehicle(rows)
         V[block, within, numbers, within, others] = covs
         V[block, within, others, within, numbers] = covs.transpose(0, 2, 1)
 
     def _by_vehicle(self, rows: Sequence[int]) -> tuple[Floats, Any, Any]:
-        """A view (B, k, 8, k, 8) of `of_vehicles`, and in which block and where within it vehicles `rows` are."""
+        """Returns a view (B, k, 8, k, 8) of `of_vehicles`, and block and index within the block of vehicles `rows`."""
         B, size, _ = self.of_vehicles.shape
         V = self.of_vehicles.reshape(B, size // OF_VEHICLE, OF_VEHICLE, size // OF_VEHICLE, OF_VEHICLE)
         return (V, 0, rows) if self.together else (V, rows, 0)
 
     def select(self, rows: Sequence[int]) -> None:
-        """Keeps the vehicles `rows` in that order; -1 makes room for a new one, to be placed next."""
+        """Keeps the vehicles `rows` in this order; -1 reserves a row for a new one (`place_vehicles`)."""
         n, M = self.nodes, len(rows)
         kept, old = [k for k, row in enumerate(rows) if row >= 0], [row for row in rows if row >= 0]
         before_V, self.layout = self.of_vehicles, StateLayout.of(n, M)
@@ -381,7 +379,7 @@ class Window:
 
 
 def _selected(numbers: NDArray[Any], kept: Sequence[int], old: Sequence[int], M: int, new: float) -> NDArray[Any]:
-    """(M, ...) of which `kept` are the `old` of these numbers, and the others `new`."""
+    """Returns (M, ...) with rows `old` of `numbers` at `kept`, and the value `new` elsewhere."""
     out = np.full((M, *numbers.shape[1:]), new, numbers.dtype)
     out[kept] = numbers[old]
     return out

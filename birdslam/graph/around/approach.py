@@ -1,8 +1,8 @@
-"""Who may come near: the closest approach of road users to the ego, were all to go on as they move now.
+"""The closest approach of road users to the ego, if all keep their present velocity.
 
-An aid for planners and no safety function: nobody's intention is in it, and nobody who was not detected.
-With p and v the place and velocity of somebody against the ego's, t = -p.v / v.v and d = |p + v t|; their sigmas come
-from the covariances of p and v to first order.
+An aid for planners, not a safety function: it knows no intentions and no undetected road users. With p and v the
+position and velocity relative to the ego, t = -p.v / v.v and d = |p + v t|; their sigmas follow from the covariances of
+p and v to first order.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ import numpy as np
 from birdslam.geometry.arrays import Complexes, Floats
 from birdslam.types import Approach
 
-HORIZON_S = 30.0  # a later approach is reported as it would be then
+HORIZON_S = 30.0  # a later approach is evaluated at this time
 NEARBY_S, NEARBY_M, NEARBY_SIGMA = 5.0, 2.0, 2.0
-SLOWEST_MPS2 = 0.01  # a squared velocity below it is none
-MAX_REPORTED = 1e9  # of any number that is reported
+SLOWEST_MPS2 = 0.01  # minimum of the squared relative velocity
+MAX_REPORTED = 1e9  # limit of every reported number
 
 
 def approaches(p: Complexes, v: Complexes, covs: Floats) -> list[Approach]:
-    """Of N road users, places p and velocities v (N,) against the ego's, in m and m/s, all in one frame.
+    """Returns the approaches of N road users with positions p and velocities v (N,) relative to the ego, in m and m/s.
 
     `covs` (N, 4, 4) are the covariances of both, (x_m, y_m, x_mps, y_mps).
     """
@@ -33,7 +33,7 @@ def approaches(p: Complexes, v: Complexes, covs: Floats) -> list[Approach]:
     np.minimum(np.maximum(free, 0.0), HORIZON_S, out=time)
     at = p + v * time
     np.abs(at, out=distance)
-    by = np.empty((2, len(p), 2), np.complex128)  # how time goes with p and v, and distance with them
+    by = np.empty((2, len(p), 2), np.complex128)  # derivatives of time and distance by p and v
     by[0, :, 0] = v / square
     by[0, :, 1] = (p + 2.0 * free * v) / square
     by[1, :, 0] = at / np.maximum(distance, 1e-6)  # towards them

@@ -1,7 +1,7 @@
-"""What the camera can't see of the road: the fans behind vehicles, out of which somebody could step.
+"""The parts of the road that vehicles hide from the camera, where somebody could step out.
 
-The camera stands over the ego's origin. A vehicle of height h, whose outline is d away along a ray, hides the road
-behind it as far as the ray over its roof goes: d H / (H - h) for a camera at H, or without end where it is as tall.
+The camera is above the origin of the ego. A vehicle of height h at a distance d along a ray hides the road behind it up
+to the ray over its roof: d H / (H - h) for a camera height H, without limit if h >= H.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from operator import itemgetter
 from birdslam.geometry.se2 import SE2
 from birdslam.types import HiddenFan, RoadUser
 
-MAX_DISTANCE_M = 40.0  # a fan ends there
-MIN_DISTANCE_M = 1.0  # a vehicle that begins nearer stands beside the camera
+MAX_DISTANCE_M = 40.0  # end of a fan
+MIN_DISTANCE_M = 1.0  # of the nearest corner of a vehicle; nearer ones are beside the camera
 USUAL_HEIGHT_M = 1.5  # of a vehicle of unknown height
-MIN_M = 0.3  # a fan that is shorter hides nobody
+MIN_M = 0.3  # minimum length of a fan
 
 
 def hidden_fans(vehicles: Sequence[RoadUser], world: SE2, camera_m: float) -> tuple[HiddenFan, ...]:
-    """Of the vehicles ahead, the nearest first; `world` is T_world_ego, `camera_m` the camera's height."""
+    """Returns the fans of the vehicles ahead, nearest first; `world` is T_world_ego, `camera_m` the camera height."""
     back, origin = cmath.rect(1.0, -world.yaw_rad), complex(world.x_m, world.y_m)
     fans: list[tuple[float, HiddenFan]] = []
     for vehicle in vehicles:

@@ -1,4 +1,4 @@
-"""Who may be in a lane: the vehicles and people of a frame, in ego."""
+"""The vehicles and people of a frame in ego, for their assignment to lanes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def lane_users(
     vehicles: Sequence[VehicleEstimate],
     people: Sequence[FollowedPerson],
 ) -> list[UserInEgo]:
-    """Everybody; `vehicles` are the estimates of `nodes`. The covariances have nothing of the ego's error in world."""
+    """Returns all road users; `vehicles` are the estimates of `nodes`. The ego's error in world is not included."""
     T_ego_world, covs, users = window.world.inverse(), window.each_vehicle[:, POSE, POSE], []
     for row, (node, estimate) in enumerate(zip(nodes, vehicles, strict=True)):
         T_ego_vehicle = T_ego_world @ estimate.T_world_vehicle

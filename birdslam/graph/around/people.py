@@ -1,8 +1,8 @@
-"""People in the world of the graph: those that the front end follows, from the ego's newest pose.
+"""The tracked people in world, relative to the newest ego pose.
 
-They are filtered outside the graph (people/people_filter.py): as its nodes their speeds would be worse,
-and a person's box says nothing of the ego. What they get here is the graph's world, epoch and ego,
-with the ego's covariance, and where frames bring no picture the way that they went on.
+They are filtered outside the graph (people/people_filter.py), since their boxes carry no information about the ego.
+This module transforms them to the world of the graph, adds the covariance of the ego, and predicts them over frames
+without an image.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from birdslam.geometry.se2 import SE2
 from birdslam.graph.around.approach import approaches
 from birdslam.types import FollowedPerson, RoadUser
 
-MAX_PEOPLE = 60  # the nearest; a message and a frame's time have their limits
-YAW_UNKNOWN = math.pi**2 / 3.0  # the variance of a direction of which nothing is known
+MAX_PEOPLE = 60  # the nearest ones; bounds the size of a message and the time of a frame
+YAW_UNKNOWN = math.pi**2 / 3.0  # variance of a uniform direction
 CHANGE_MPS = 0.8  # 1-sigma by which a velocity changes within a second, as in `people_config.Sizes`
-TURNS_MPS = 0.5  # who moves slower has no yaw
-MAX_DISTANCE_M, FASTEST_MPS = 1e4, 1e3  # somebody beyond is no person, but numbers that no front end made
+TURNS_MPS = 0.5  # minimum speed for a yaw
+MAX_DISTANCE_M, FASTEST_MPS = 1e4, 1e3  # beyond them the record is corrupt
 _LIMITS = np.repeat([MAX_DISTANCE_M, FASTEST_MPS, MAX_DISTANCE_M**2, FASTEST_MPS**2], [2, 2, 4, 4])
 
 
 def people_estimates(
     people: Sequence[FollowedPerson], since_s: float, world: SE2, ego_cov: Floats, ego_mps: complex, way: SE2
 ) -> tuple[RoadUser, ...]:
-    """Everybody in world, `since_s` after they were seen in the ego's axes, over which the ego went on by `way`.
+    """Returns all people in world, `since_s` after they were seen in ego; `way` is the ego's motion since then.
 
     `world` is T_world_ego when they were seen, `ego_cov` (3, 3) of its tangent; `ego_mps` is the ego's velocity.
     """
@@ -54,10 +54,10 @@ def people_estimates(
         of_velocity += CHANGE_MPS**2 * since_s * np.eye(2)
     near = approaches(p - complex(way.x_m, way.y_m), v - ego_mps, covs)
     xx, xy, yy = (np.array([cov[:, i, j] for cov in (of_place, of_velocity)]) for i, j in ((0, 0), (0, 1), (1, 1)))
-    means, deviators = 0.5 * (xx + yy), 0.5 * (xx - yy) + 1j * xy  # as costs.py has them
+    means, deviators = 0.5 * (xx + yy), 0.5 * (xx - yy) + 1j * xy  # as in costs.py
     speed = np.abs(v)
-    heading = np.where(speed > TURNS_MPS, v / np.maximum(speed, TURNS_MPS), 1.0)  # against the ego
-    # The ego's error moves everybody: by its place, and by its yaw the more the farther they are
+    heading = np.where(speed > TURNS_MPS, v / np.maximum(speed, TURNS_MPS), 1.0)  # relative to the ego
+    # The error of the ego adds to all: its position, and its yaw times the distance
     (exx, exy, ext), (_, eyy, eyt), (*_, ett) = ego_cov.tolist()
     yaw_var, with_yaw = max(ett, 0.0), complex(ext, eyt)
     lever, across = levers = 1j * np.array([p, v])
