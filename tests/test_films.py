@@ -331,3 +331,48 @@ def test_pixels_of_anamorphic_films_are_made_square(tmp_path: Path, name: str, a
     across, down = bright.any(axis=0).sum(), bright.any(axis=1).sum()
     assert across == pytest.approx(80, abs=4)
     assert down == pytest.approx(80, abs=4)
+
+
+def moving_film(path: Path, numbers: Sequence[int], quality: str = "20") -> Path:
+    """Frames of a texture that moves by 3 px a frame; two films of the same numbers differ by their compression."""
+    texture = cv2.GaussianBlur(np.random.default_rng(3).integers(0, 256, (480, 2400), dtype=np.uint8), (0, 0), 4.0)
+    texture = np.asarray(cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX), np.uint8)  # type: ignore[call-overload]
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=30, options={"crf": quality})
+        stream.width, stream.height, stream.pix_fmt = 320, 240, "yuv420p"
+        for k in numbers:
+            grey = texture[100:340, 3 * k : 3 * k + 320]
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.dstack([grey] * 3), "bgr24")))
+        container.mux(stream.encode(None))
+    return path
+
+
+WIDE = Camera(320, 240, 300.0, 300.0, 160.0, 120.0, 1.4)
+
+
+@pytest.mark.parametrize("overlap", [0, 7, 30, 75])
+def test_films_that_overlap_are_one_drive_without_a_frame_twice(tmp_path: Path, overlap: int) -> None:
+    moving_film(tmp_path / "a_001.mp4", range(120))
+    moving_film(tmp_path / "a_002.mp4", range(120 - overlap, 200), quality="30")
+    seen = list(open_recording(f"video:{tmp_path}", WIDE).frames())
+    assert len(seen) == 200
+    times = np.array([frame.t_source_ns for frame in seen])
+    np.testing.assert_allclose(np.diff(times), 1e9 / 30.0, atol=2e6)
+    images = [np.asarray(frame.image, np.float64)[..., 0] for frame in seen]
+    step = np.abs(images[120] - images[119]).mean()
+    assert step == pytest.approx(np.abs(images[100] - images[99]).mean(), rel=0.5)  # one step, neither none nor many
+    later = list(open_recording(f"video:{tmp_path}", WIDE).frames(start=150))
+    assert [(frame.index, frame.t_source_ns) for frame in later] == [(f.index, f.t_source_ns) for f in seen[150:]]
+
+
+def test_films_of_a_stationary_camera_are_not_cut(tmp_path: Path) -> None:
+    moving_film(tmp_path / "a_001.mp4", [5] * 60)
+    moving_film(tmp_path / "a_002.mp4", [5] * 60)
+    assert len(list(open_recording(f"video:{tmp_path}", WIDE).frames())) == 120
+
+
+@pytest.mark.parametrize(("codec", "suffix"), [("libx264", "h264"), ("libx265", "hevc")])
+def test_a_raw_stream_is_refused_with_the_remedy(tmp_path: Path, codec: str, suffix: str) -> None:
+    path = film(tmp_path / f"raw.{suffix}", range(0, 1000, 33), codec=codec)
+    with pytest.raises(DatasetError, match="ffmpeg -framerate"):
+        frames(path)

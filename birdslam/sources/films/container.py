@@ -46,6 +46,17 @@ def why_unreadable(path: Path) -> str:
     return "is no video that OpenCV can open: no pictures in it, or of a codec that it has not"
 
 
+def is_raw_stream(path: Path) -> bool:
+    """Whether a file is H.264 or HEVC without a container (Annex B): it states no times of frames."""
+    try:
+        head = _read(path, 0, 5)
+    except OSError:
+        return False
+    begin = 4 if head[:4] == b"\0\0\0\1" else 3
+    program_stream = head[:4] in (b"\0\0\1\xba", b"\0\0\1\xb3")  # MPEG-1 and MPEG-2 state their times
+    return head[begin - 3 : begin] == b"\0\0\1" and len(head) > begin and not program_stream
+
+
 def is_torn(path: Path) -> bool:
     """Whether an MPEG transport stream (ISO/IEC 13818-1) ends within a packet: it states no length, so that one that
     was cut off looks whole. False of other files, and where it can't be read."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from itertools import pairwise
@@ -12,10 +13,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.ros.bag import BagTopics
-from birdslam.sources.films.container import films_in, is_torn, stated_focal_rel, why_unreadable
+from birdslam.sources.films.container import films_in, is_raw_stream, is_torn, stated_focal_rel, why_unreadable
 from birdslam.sources.films.interlaced import is_undecoded
 from birdslam.sources.recording import DatasetError, RecordedFrame, Recording
 from birdslam.sources.schemes import VIDEO
@@ -23,6 +26,9 @@ from birdslam.types import NS_PER_S
 
 GAP_NS = NS_PER_S  # a longer time between two frames is reported as a frame without an image
 NAME_RESOLUTION_S = 2.0  # names tell times by the second, and each of two may be rounded
+OVERLAP_S = 3.0  # the longest overlap of two films that is searched for
+OVERLAP_FRAMES = 5  # consecutive frames that must agree
+_MAX_DIFFERENCE, _MAX_DIFFERENCE_REL = 8.0, 0.5  # mean, in grey levels, and relative to the best other part
 _COUNTED = (".mp4", ".mov", ".m4v", ".avi", ".3gp")  # containers that say how many frames there are
 _USUAL_HZ = 1.0, 240.0  # a rate that a container states outside of these is measured
 _MEASURED_FRAMES = 24
@@ -59,7 +65,8 @@ class VideoRecording(Recording):
 
     Frames have the container's own times, also where those are uneven, and stand upright as a phone's film says.
     `len` is what the containers declare (0 where one declares nothing). Films follow each other without a gap, but
-    where their names tell times that leave one. A gap of more than a second, there or within a film, is one frame
+    where their names tell times that leave one. Where a film begins with the last frames of the one before, these are
+    left out. A gap of more than a second, there or within a film, is one frame
     without an image.
     """
 
@@ -97,21 +104,41 @@ class VideoRecording(Recording):
     def frames(self, start: int = 0) -> Iterator[RecordedFrame]:
         """Every frame in order, its time from the container; a file cut off ends with one unreadable frame."""
         index, t_ns = 0, -self._films[0].period_ns
+        tail: deque[Floats] = deque(maxlen=1)  # the last frames of a film, small
         for film in self._films:
             begin_ns = t_ns + film.period_ns + film.gap_ns
-            for frame in self._frames_of(film, index, begin_ns, t_ns, start):
+            skipped = _overlap(film.path, list(tail)) if tail and not film.gap_ns else 0
+            tail = deque(maxlen=max(1, round(OVERLAP_S * film.rate_hz)))
+            for frame in self._frames_of(film, index, begin_ns, t_ns, start, skipped, tail):
                 index, t_ns = frame.index + 1, frame.t_source_ns
                 if frame.index >= start:
                     yield frame
 
-    def _frames_of(self, film: _Film, index: int, begin_ns: int, last_ns: int, start: int) -> Iterator[RecordedFrame]:
-        """One file's, numbered from `index` on; those before `start` are not decoded to an image."""
+    def _frames_of(
+        self,
+        film: _Film,
+        index: int,
+        begin_ns: int,
+        last_ns: int,
+        start: int,
+        skipped: int,
+        tail: deque[Floats],
+    ) -> Iterator[RecordedFrame]:
+        """One file's without its first `skipped`, numbered from `index` on; small ones are added to `tail`.
+
+        Frames before `start` are not decoded to an image, but for the last ones, which `tail` needs.
+        """
+        followed = film is not self._films[-1]
         capture = _capture(film.path)
         square = _size(capture)
         try:
             position, shift_ns, t_ns = 0, begin_ns, last_ns
             while capture.grab():
                 stamp_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6) + shift_ns
+                if position < skipped:
+                    position += 1
+                    shift_ns = begin_ns - (stamp_ns - shift_ns) - film.period_ns  # of the next frame, the first kept
+                    continue
                 if stamp_ns <= t_ns:  # a clock that restarted, or a container without times, which gives zeros
                     shift_ns += t_ns + film.period_ns - stamp_ns
                     stamp_ns = t_ns + film.period_ns
@@ -121,7 +148,10 @@ class VideoRecording(Recording):
                     yield RecordedFrame(index, t_ns - film.period_ns // 2, None, words)
                     index += 1
                 if position % self._stride == 0:
-                    ok, image = capture.retrieve() if index >= start else (False, None)
+                    is_last = followed and position >= film.declared - tail.maxlen  # type: ignore[operator]
+                    ok, image = capture.retrieve() if index >= start or is_last else (False, None)
+                    if ok and is_last and image is not None:
+                        tail.append(_small(image))
                     if ok and image is not None and square != (image.shape[1], image.shape[0]):
                         image = cv2.resize(image, square, interpolation=cv2.INTER_LINEAR)
                     error = None if ok else f"{film.path}: frame {position} can't be decoded"
@@ -148,6 +178,11 @@ def _film(path: Path, camera: Camera) -> _Film:
         rate_hz = _measured_hz(capture)
         declared = round(declared * rate_hz) if math.isfinite(rate_hz) else 0
     capture.release()
+    if is_raw_stream(path):
+        raise DatasetError(
+            f"{path}: a raw stream without the times of its frames; put it into a container at the camera's rate: "
+            f"ffmpeg -framerate HZ -i {path.name} -c copy film.mp4"
+        )
     if is_undecoded(path):
         raise DatasetError(
             f"{path}: is interlaced, which this OpenCV can't decode; make it progressive first: "
@@ -182,6 +217,35 @@ def _in_sequence(films: list[_Film]) -> list[_Film]:
         gap_ns = round(gap_s * NS_PER_S) if gap_s > NAME_RESOLUTION_S else 0
         out.append(_Film(film.path, film.rate_hz, film.declared, gap_ns))
     return out
+
+
+def _small(image: NDArray[np.uint8]) -> Floats:
+    """Every 16th pixel of an image (one channel), to compare frames by."""
+    return np.asarray(image[8::16, 8::16] if image.ndim == 2 else image[8::16, 8::16, 1], np.float64)
+
+
+def _overlap(path: Path, tail: Sequence[Floats]) -> int:
+    """Returns how many frames at the beginning of a film are the last ones of the film before, whose `tail` is given.
+
+    Its first frames are compared with every part of the tail. One part must agree far better than all that are not next
+    to it, which excludes a stationary camera.
+    """
+    capture, first = _capture(path), list[Floats]()
+    while len(first) < OVERLAP_FRAMES and capture.grab():
+        ok, image = capture.retrieve()
+        if not ok:
+            break
+        first.append(_small(np.asarray(image, np.uint8)))
+    capture.release()
+    if len(first) < OVERLAP_FRAMES or len(tail) < 2 * OVERLAP_FRAMES or first[0].shape != tail[0].shape:
+        return 0
+    frames, starts = np.stack(tail), np.arange(len(tail) - OVERLAP_FRAMES + 1)
+    differences = np.array([np.abs(frames[starts + k] - small).mean(axis=(1, 2)) for k, small in enumerate(first)])
+    difference = differences.mean(axis=0)
+    best = int(difference.argmin())
+    others = difference[np.abs(starts - best) > OVERLAP_FRAMES]
+    is_clear = len(others) > 0 and difference[best] < min(_MAX_DIFFERENCE, _MAX_DIFFERENCE_REL * others.min())
+    return len(tail) - best if is_clear else 0
 
 
 def _name_time(path: Path) -> datetime | None:
