@@ -24,7 +24,7 @@ from birdslam.geometry.se2 import SE2
 from birdslam.runtime.client import Planner, Reading
 from birdslam.runtime.topology import key_of
 from birdslam.runtime.transport.bus import Bus, BusClosed, BusError, MessagesLost, Subscriber
-from birdslam.runtime.transport.endpoints import UNPACKED
+from birdslam.runtime.transport.endpoints import MAX_UNPACKED
 from birdslam.runtime.transport.presence import VehicleBusy, VehicleLock, ring_path, runtime_dir_of, socket_path
 from birdslam.runtime.wire import MAX_MESSAGE_BYTES, Stage, Trace, encode
 from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, Status
@@ -145,7 +145,7 @@ def test_messages_that_wait_behind_many_are_kept_as_bytes_and_come_out_the_same(
         out.put(measurements(frame_id))
     until(lambda: queue.newest and queue.newest.record.frame_id == 39, "the last record")
     waiting = list(queue._queue)  # private: what waits shows in memory alone
-    assert sum(not hasattr(each, "record") for each in waiting) == 40 - UNPACKED
+    assert sum(not hasattr(each, "record") for each in waiting) == 40 - MAX_UNPACKED
     came = [received(queue) for _ in range(40)]
     assert [message.record for message in came] == [measurements(frame_id) for frame_id in range(40)]
     assert [message.trace.number for message in came] == list(range(1, 41))

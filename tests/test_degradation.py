@@ -186,7 +186,7 @@ def test_what_runs_aside_runs_where_nothing_is_to_be_left_out(tmp_path: Path, pi
     configuration = complete(configuration, Camera(64, 32, 50.0, 50.0, 32.0, 16.0, 1.5), 33.0)
     with Inference(configuration) as networks:
         node = PerceiveNode(configuration, networks, Blind(), Bus(), FIRST)  # type: ignore[arg-type]
-        assert networks.aside is not None
-        done = networks.aside(lambda: "lanes")
+        assert networks.run_in_background is not None
+        done = networks.run_in_background(lambda: "lanes")
         assert len(list(node.step(FrameRef(frame_id=0, **pixels, t_source_ns=0, t_capture_ns=0, t_utc_ns=0)))) == 1
         assert done.result(timeout=60.0) == "lanes"

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from birdslam.runtime.supervision.journal import Journal, Priority, journal_behind
+from birdslam.runtime.supervision.journal import Journal, Priority, journal_of
 from birdslam.runtime.supervision.live import LiveLine
 
 
@@ -53,19 +53,19 @@ def test_a_journal_that_is_gone_stops_nothing(tmp_path: Path) -> None:
 def test_the_journal_is_used_where_it_is_behind_the_stream(tmp_path: Path) -> None:
     with (tmp_path / "out").open("w") as stream:
         state = os.fstat(stream.fileno())
-        assert journal_behind(stream, {"JOURNAL_STREAM": f"{state.st_dev}:{state.st_ino}"}) is not None
-        assert journal_behind(stream, {"JOURNAL_STREAM": f"{state.st_dev}:{state.st_ino + 1}"}) is None
-        assert journal_behind(stream, {"JOURNAL_STREAM": "nonsense"}) is None
-        assert journal_behind(stream, {}) is None
-    assert journal_behind(io.StringIO(), {"JOURNAL_STREAM": "1:1"}) is None
-    assert journal_behind(sys.stdout, {}) is None
+        assert journal_of(stream, {"JOURNAL_STREAM": f"{state.st_dev}:{state.st_ino}"}) is not None
+        assert journal_of(stream, {"JOURNAL_STREAM": f"{state.st_dev}:{state.st_ino + 1}"}) is None
+        assert journal_of(stream, {"JOURNAL_STREAM": "nonsense"}) is None
+        assert journal_of(stream, {}) is None
+    assert journal_of(io.StringIO(), {"JOURNAL_STREAM": "1:1"}) is None
+    assert journal_of(sys.stdout, {}) is None
 
 
 def test_what_a_node_says_is_a_warning_of_that_node(
     reader: tuple[socket.socket, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     end, address = reader
-    monkeypatch.setattr("birdslam.runtime.supervision.live.journal_behind", lambda stream: Journal(address))
+    monkeypatch.setattr("birdslam.runtime.supervision.live.journal_of", lambda stream: Journal(address))
     with (tmp_path / "out").open("w+") as stream:
         line = LiveLine(stream)
         for text in ("capture: the camera is late", "optimize was killed by SIGKILL", "all is written"):

@@ -199,7 +199,7 @@ def test_nobody_notices_that_the_map_process_dies_stalls_and_has_a_full_disk(
         whole = path.read_bytes()  # what was being saved when the limit came is in it
         out = run.stop()
     assert "map was killed by SIGKILL" in out
-    assert "map is stalled: its loop has shown no life" in out
+    assert "map is stalled: no heartbeat" in out
     summary = run.summary()
     assert set(summary["restarts"].values()) == {0}
     assert summary["map"]["restarts"] == 2, out

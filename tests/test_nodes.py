@@ -168,7 +168,7 @@ def test_a_camera_that_falls_silent_is_named(monkeypatch: pytest.MonkeyPatch, tm
     source = Source(1, live=True)
     node, _, reader = make_capture(monkeypatch, tmp_path, source, rate=None, camera_timeout_s=0.2)
     next(node.step(receive(node).record))
-    with pytest.raises(SourceError, match=r"source: has delivered no frame for 0\.2 s"):
+    with pytest.raises(SourceError, match=r"source: no frame for 0\.2 s"):
         receive(node)
     source.over.set()
     node.close()

@@ -249,7 +249,7 @@ def test_three_processes_give_the_bytes_of_one(drive: Path, place: Path) -> None
     status, out, err = run.end()
     assert (status, err) == (0, "")
     assert f"{TORN:06d}.png" in out
-    assert "networks began on" in out
+    assert "networks ran on" in out
 
     live = records_of_three(file)
     assert live == records_of_one_process(sequence, {}, speed)
@@ -373,7 +373,7 @@ def test_without_restarts_a_stalled_node_ends_the_run_with_its_name(drive: Path,
         run.stall("optimize")
         status, _, err = run.end()
         assert status == 1
-        assert err.startswith(f"birdslam: optimize is stalled: its loop has shown no life for {1e3 * LIMIT_S:g} ms")
+        assert err.startswith(f"birdslam: optimize is stalled: no heartbeat for {1e3 * LIMIT_S:g} ms")
         assert err.count("\n") == 1
         assert run.summary()["frames_processed"] > 0
         assert run.left_behind() == []

@@ -361,7 +361,7 @@ def test_kills_and_restarts_cost_no_bit_and_a_kill_of_everything_leaves_a_file_t
         pytest.param(lambda run: os.kill(run.node_pid("record"), signal.SIGKILL), "was killed by SIGKILL", id="dies"),
         pytest.param(
             lambda run: run.stall("record"),
-            f"is stalled: its loop has shown no life for {1e3 * LIMIT_S:g} ms",
+            f"is stalled: no heartbeat for {1e3 * LIMIT_S:g} ms",
             id="stalls",
             marks=pytest.mark.slow,  # test_pipeline.py stalls a node
         ),
@@ -393,7 +393,7 @@ def test_a_recorder_is_restarted_with_a_new_file_and_ends_where_the_disk_is_full
         resource.prlimit(run.node_pid("record"), resource.RLIMIT_FSIZE, (limit, limit))
         drive_on(planner, 60)
         out = run.stop()
-    assert f"record {cause}; it is restarted" in out
+    assert f"record {cause}; it is being restarted" in out
     assert "the recording has ended: File too large" in out
     assert "restarted 1 times, CUT OFF" in out
     assert set(run.summary()["restarts"].values()) == {0}

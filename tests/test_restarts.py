@@ -21,7 +21,7 @@ from birdslam.runtime.process.notify import Notifier
 from birdslam.runtime.process.restarts import EpochFile, Restarts, Resume
 from birdslam.runtime.process.vitals import Vitals
 from birdslam.runtime.supervision.processes import waited_s
-from birdslam.runtime.supervision.stations import MISSED_RECORDS, Intake, Silence
+from birdslam.runtime.supervision.stations import MAX_MISSED_RECORDS, Intake, Silence
 from tests.test_bus import until
 
 CONFIG = RuntimeConfig(restarts_max=3, restart_window_s=10.0, restart_backoff_ms=100.0, restart_backoff_max_ms=150.0)
@@ -92,13 +92,13 @@ def test_a_node_that_takes_anything_in_is_left_alone(steps: list[tuple[int, int]
         since = sent if heard else since
         missed = intake.missed(sent, taken, 0.1, float(second), 1.5)
         assert missed in (0, sent - since)
-        assert bool(missed) <= (sent - since >= MISSED_RECORDS)
+        assert bool(missed) <= (sent - since >= MAX_MISSED_RECORDS)
 
 
 def test_silence_is_no_missed_record() -> None:
     intake = Intake()
     assert not any(intake.missed(5, 5, 0.1, float(second), 1.0) for second in range(100))
-    assert intake.missed(5 + MISSED_RECORDS, 5, 0.1, 100.0, 1.0) == MISSED_RECORDS
+    assert intake.missed(5 + MAX_MISSED_RECORDS, 5, 0.1, 100.0, 1.0) == MAX_MISSED_RECORDS
     assert intake.missed(2, 5, 0.1, 101.0, 1.0) == 0  # the sender restarted
 
 

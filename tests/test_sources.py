@@ -191,7 +191,7 @@ def test_a_missing_recording_is_named(tmp_path: Path) -> None:
 
 
 def test_a_camera_that_is_not_there_is_named(tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match=r"v4l2:/dev/no_such: there is no device /dev/no_such"):
+    with pytest.raises(SourceError, match=r"v4l2:/dev/no_such: no such device: /dev/no_such"):
         open_source(live("v4l2:/dev/no_such"))
     file = tmp_path / "video0"
     file.write_bytes(b"no camera")

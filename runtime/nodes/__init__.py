@@ -1,5 +1,1 @@
-"""What each process does: capture, perceive, optimize, record.
-
-Read `nodes` first (each node in a few lines around its objects of birdslam/), then `runner`, the loop that all of
-them run.
-"""
+"""The processes: capture, perceive, optimize, record. `nodes` defines the nodes, `runner` the loop that runs them."""

@@ -16,17 +16,17 @@ from birdslam.runtime.configuration import Configuration
 from birdslam.runtime.nodes.sources import SourceError
 from birdslam.sources.recording import RecordedFrame
 
-LIVE_RATE_HZ = 30.0  # of a camera that does not say
+LIVE_RATE_HZ = 30.0  # of a camera that does not report its rate
 
 
 class LiveCamera(ABC):
-    """A source (nodes/sources.py) whose frames are stamped with CLOCK_MONOTONIC as they come."""
+    """A source (nodes/sources.py) whose frames are stamped with CLOCK_MONOTONIC on arrival."""
 
     live = True
 
     def __init__(self, configuration: Configuration, must_open: bool = True) -> None:
-        """Raises SourceError where it does not open; without `must_open` that is a camera that is gone for now."""
-        assert configuration.camera is not None  # `open_source` has refused it
+        """Raises SourceError if the camera does not open, unless `must_open` is False."""
+        assert configuration.camera is not None  # checked by `open_source`
         config = configuration.source
         self.name = self._uri = config.uri
         self.camera = configuration.camera
@@ -42,7 +42,7 @@ class LiveCamera(ABC):
 
     @abstractmethod
     def _connect(self) -> cv2.VideoCapture:
-        """The camera, asked for its image size and rate; `_open` checks whether it opened."""
+        """Returns the capture with image size and rate requested; `_open` checks whether it opened."""
 
     def _open(self) -> cv2.VideoCapture:
         capture = self._connect()
@@ -59,7 +59,7 @@ class LiveCamera(ABC):
         return capture
 
     def frames(self) -> Generator[RecordedFrame]:
-        """Frames by CLOCK_MONOTONIC; while the camera is gone, frames without an image, until it opens again."""
+        """Yields frames stamped with CLOCK_MONOTONIC; frames without an image while the camera is disconnected."""
         try:
             for index in islice(count(), self._config.frames):
                 if self._capture is None or not self._capture.grab():
@@ -76,7 +76,7 @@ class LiveCamera(ABC):
             self.close()
 
     def _reopen(self) -> None:
-        """One attempt; after a failure a pause, which limits how often the loss is reported."""
+        """Tries once to reopen the camera; pauses after a failure, which limits how often the loss is reported."""
         if self._capture is not None:
             self._capture.release()
             self._capture = None
@@ -85,11 +85,11 @@ class LiveCamera(ABC):
         except SourceError:
             self._closing.wait(self._config.reopen_ms / 1e3)
 
-    def resume(self, frame_id: int, t_source_ns: int) -> None:  # noqa: B027  # nothing is to be done
-        """A camera just goes on."""
+    def resume(self, frame_id: int, t_source_ns: int) -> None:  # noqa: B027  # optional hook
+        """Does nothing: a live camera needs no seek."""
 
     def close(self) -> None:
-        """Lets the camera go."""
+        """Releases the camera."""
         self._closing.set()
         if self._capture is not None:
             self._capture.release()
@@ -101,19 +101,19 @@ class DeviceCamera(LiveCamera):
     def _connect(self) -> cv2.VideoCapture:
         address = self._uri.partition(":")[2]
         if not Path(address).exists():
-            raise SourceError(f"{self._uri}: there is no device {address}")
+            raise SourceError(f"{self._uri}: no such device: {address}")
         capture = cv2.VideoCapture(address, cv2.CAP_V4L2)
         if capture.isOpened():
             capture.set(cv2.CAP_PROP_FRAME_WIDTH, self.camera.width_px)
             capture.set(cv2.CAP_PROP_FRAME_HEIGHT, self.camera.height_px)
             if isinstance(self._config.rate, float):
                 capture.set(cv2.CAP_PROP_FPS, self._config.rate)
-            capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # an older image is worth less than a lost one
+            capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # deliver the newest image
         return capture
 
 
 class NetworkCamera(LiveCamera):
-    """`rtsp://HOST/PATH`, by FFmpeg."""
+    """`rtsp://HOST/PATH`, read by FFmpeg."""
 
     def _connect(self) -> cv2.VideoCapture:
         timeout_ms = round(self._config.camera_timeout_s * 1e3)

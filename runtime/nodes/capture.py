@@ -1,4 +1,4 @@
-"""What the capture process does: frames from their source at their time, undistorted, into the ring."""
+"""The capture process: reads frames from their source at their time, undistorts them and writes them to the ring."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from birdslam.types import Frame, FrameRef, Measurements, Status
 
 @dataclass(frozen=True)
 class Captured:
-    """A frame of the source at its time, not yet undistorted."""
+    """A frame of the source with its capture time, not yet undistorted."""
 
     frame_id: int
     recorded: RecordedFrame
@@ -32,7 +32,7 @@ class Captured:
 
 
 class CaptureNode:
-    """camera -> FrameRef: paces, stamps and undistorts frames, and lays their pixels into the ring."""
+    """camera -> FrameRef: paces, stamps and undistorts frames, and writes their pixels to the ring."""
 
     mode: str = Mode.FULL
 
@@ -50,7 +50,7 @@ class CaptureNode:
         self._ring = FrameRing(path, camera.height_px, camera.width_px, slots=configuration.runtime.ring_slots)
         self._pacer = Pacer(configuration.source.rate)
         self._estimates = bus.subscriber("estimate")
-        # Those of a file go with the frames, and a run at rate "max" is to repeat: neither listens to the bus
+        # Not with a speed file, whose readings come with the frames, nor at rate "max", which must be reproducible
         own = configuration.source.speed or configuration.lossless
         self._speeds = None if own else CarSpeeds(bus.subscriber("speed"))
         self._reader: ReadAhead | None = None
@@ -63,7 +63,7 @@ class CaptureNode:
         self._end_sent = False
 
     def receive(self, timeout_s: float) -> Message | None:
-        """The next frame when it is due; at rate "max" when few enough are in flight; END_OF_SOURCE at the end."""
+        """Returns the next frame when it is due, at rate "max" when few enough are in flight; at last END_OF_SOURCE."""
         until_s = time.monotonic() + timeout_s
         if self._reader is None:
             first_frame = 0 if self._resume is None else self._go_on(self._resume)
@@ -75,7 +75,7 @@ class CaptureNode:
             if back is None:
                 return None
             self._returned = back.record.frame_id
-            if Status.END_OF_SOURCE in back.record.status:  # all pixels are read: the ring may go
+            if Status.END_OF_SOURCE in back.record.status:  # all pixels are read: the ring can be removed
                 self.ended = True
                 return None
         if self._over_since_s is not None:
@@ -97,7 +97,7 @@ class CaptureNode:
         return Message(Captured(frame_id, recorded, t_capture_ns), Trace(), t_capture_ns)
 
     def _go_on(self, resume: Resume) -> int:
-        """The frame that is due now; it leaves out one at least, so that perceive sees a gap."""
+        """Returns the frame that is due now. It skips at least one, so that perceive sees a gap."""
         rate = self._config.source.rate
         hz = rate if isinstance(rate, float) else self._source.rate_hz
         missed = max(1, math.floor((time.monotonic_ns() - resume.t_capture_ns) * 1e-9 * hz))
@@ -108,7 +108,7 @@ class CaptureNode:
         return frame_id
 
     def _must_wait(self) -> bool:
-        """For an estimate to come back: all at the end, so that END_OF_SOURCE pushes no frame out of a queue of one."""
+        """Whether to wait for estimates: at the end for all, so that END_OF_SOURCE displaces no frame from a queue."""
         runtime, in_flight = self._config.runtime, self._sent - 1 - self._returned
         if self._end_sent:
             return True
@@ -117,7 +117,7 @@ class CaptureNode:
         return self._config.lossless and in_flight >= runtime.in_flight_frames
 
     def _due(self, frame_id: int, recorded: RecordedFrame, until_s: float) -> int | None:
-        """When the frame is captured; None where that is after `until_s`."""
+        """Returns the capture time of the frame; None if that is after `until_s`."""
         if self._source.live:
             return recorded.t_source_ns
         now_ns = time.monotonic_ns()
@@ -130,7 +130,7 @@ class CaptureNode:
     def _check_camera(self) -> None:
         limit_s = self._config.source.camera_timeout_s
         if self._source.live and time.monotonic() - self._quiet_since_s > limit_s:
-            raise SourceError(f"{self._source.name}: has delivered no frame for {limit_s:g} s")
+            raise SourceError(f"{self._source.name}: no frame for {limit_s:g} s")
 
     def step(self, captured: Captured | FrameRef) -> Iterator[FrameRef]:
         if isinstance(captured, FrameRef):
@@ -141,7 +141,7 @@ class CaptureNode:
         frame = to_frame(self._undistort, captured.frame_id, captured.recorded, t_capture_ns, _utc_ns(t_capture_ns))
         if self._speeds is not None:
             readings = self._speeds.at(frame.t_source_ns, t_capture_ns)
-            frame = replace(frame, speeds=frame.speeds or readings)  # a recording's own go before
+            frame = replace(frame, speeds=frame.speeds or readings)  # readings of the recording take precedence
         self._sent = frame.frame_id + 1
         self._t_source_ns = frame.t_source_ns
         yield self._reference(frame)
@@ -198,7 +198,7 @@ def _utc_ns(t_monotonic_ns: int) -> int:
 
 
 def stamps(record: Frame | FrameRef | Measurements) -> dict[str, Any]:
-    """The number and the times of a frame."""
+    """Returns the number and the times of a frame as keyword arguments of a record."""
     return {
         "frame_id": record.frame_id,
         "t_source_ns": record.t_source_ns,

@@ -16,7 +16,7 @@ log = logging.getLogger(__name__)
 
 
 class Readings(Protocol):
-    """What it needs of a bus.Subscriber of the topic `speed`."""
+    """The used interface of a bus.Subscriber of the topic `speed`."""
 
     dropped: int
     malformed: int
@@ -25,21 +25,20 @@ class Readings(Protocol):
 
 
 class CarSpeeds:
-    """The readings of the last second by when they came, the newest few where too many come; of fixed size."""
+    """The readings that arrived in the last second, at most KEPT_READINGS."""
 
     def __init__(self, subscriber: Readings) -> None:
         self._subscriber = subscriber
-        self._recent: deque[tuple[int, SpeedReading]] = deque(maxlen=KEPT_READINGS)  # when it came, by CLOCK_MONOTONIC
+        self._recent: deque[tuple[int, SpeedReading]] = deque(maxlen=KEPT_READINGS)  # arrival on CLOCK_MONOTONIC
         self._taken = 0
         self._warned = False
 
     def at(self, t_source_ns: int, t_capture_ns: int) -> tuple[SpeedReading, ...]:
-        """For the frame of that time.
+        """Returns the readings for a frame, on the clock of its source.
 
-        The car goes by CLOCK_MONOTONIC, as a live camera does; a reading of time 0 bears the time when it came. Beside
-        a recording that is paced they come into its clock.
+        Readings arrive on CLOCK_MONOTONIC; a reading with time 0 gets its time of arrival.
         """
-        for _ in range(KEPT_READINGS):  # a flood holds no frame up
+        for _ in range(KEPT_READINGS):  # bounded, so that a flood of readings does not delay the frame
             message = self._subscriber.recv(0.0)
             if message is None:
                 break
@@ -54,10 +53,10 @@ class CarSpeeds:
             self._recent.popleft()
         if self._subscriber.dropped and not self._warned:
             self._warned = True
-            log.warning("the car's speed: readings are lost: more come than a frame bears, or some on their way")
+            log.warning("the car's speed: readings are lost: more arrive than fit into a frame, or the bus drops some")
         return tuple(reading for _, reading in self._recent)
 
     def counters(self) -> dict[str, int]:
-        """Since the start, as in wire.Health."""
+        """Returns the counters since the start, named as in wire.Health."""
         taken = self._subscriber
         return {"speeds": self._taken, "speeds_dropped": taken.dropped, "malformed": taken.malformed}

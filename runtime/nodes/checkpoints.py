@@ -1,7 +1,7 @@
 """The optimizer's last checkpoints, in a file of the vehicle's runtime directory that survives a kill -9.
 
-The file is mapped, so that a store is a copy in memory. Two places take turns, and a place's number is written last:
-whatever a kill cuts short, the other one is whole. (What is inside is checked by `PoseGraph.restore`.)
+The file is memory-mapped. Two slots are written alternately, each with its sequence number last: if the process is
+killed while it writes one, the other is complete. `PoseGraph.restore` checks the contents.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from birdslam.runtime.transport.presence import runtime_dir_of
 
 MAX_BYTES = 1 << 20
 _PLACES, _HEAD_BYTES = 2, 64
-_TURN, _FRAME, _EPOCH, _BYTES = range(4)  # words of a head; _TURN is 0 where there is nothing
+_TURN, _FRAME, _EPOCH, _BYTES = range(4)  # words of a header; _TURN is 0 in an empty slot
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A checkpoint: the last frame that is in it, and the epoch that it is of."""
+    """A checkpoint with its last frame and its epoch."""
 
     frame_id: int
     epoch: int
@@ -34,12 +34,12 @@ class Checkpoint:
 
 
 def checkpoint_path(configuration: Configuration) -> Path:
-    """Where the checkpoints of this vehicle lie."""
+    """Returns the path of this vehicle's checkpoints."""
     return runtime_dir_of(configuration.vehicle, configuration.runtime_dir) / "checkpoint"
 
 
 class CheckpointFile:
-    """Written by the optimizer at work, read once by the one after it. Raises OSError where there is no room for it."""
+    """Written by the optimizer, read once by its successor. Raises OSError if the disk is full."""
 
     def __init__(self, path: Path) -> None:
         fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
@@ -55,9 +55,9 @@ class CheckpointFile:
         self._turn = max(int(head[_TURN]) for head in self._heads)
 
     def store(self, frame_id: int, epoch: int, data: bytes) -> bool:
-        """One more, over the older of the two; False where it is too large."""
+        """Overwrites the older of the two checkpoints; returns False if `data` is too large."""
         if len(data) > MAX_BYTES:
-            log.warning("a checkpoint of %d B is over %d B: a restart will begin a new epoch", len(data), MAX_BYTES)
+            log.warning("a checkpoint of %d B is over %d B: a restart will start a new epoch", len(data), MAX_BYTES)
             return False
         self._turn += 1
         head, body = self._heads[self._turn % _PLACES], self._bodies[self._turn % _PLACES]
@@ -68,7 +68,7 @@ class CheckpointFile:
         return True
 
     def take(self) -> list[Checkpoint]:
-        """What there is, the newest first. They are removed: a checkpoint that crashes the optimizer does so once."""
+        """Returns and removes the checkpoints, newest first; one that crashes the optimizer is not read twice."""
         found = []
         for head, body in sorted(zip(self._heads, self._bodies, strict=True), key=lambda place: -int(place[0][_TURN])):
             if head[_TURN] > 0 and 0 < head[_BYTES] <= MAX_BYTES:
@@ -78,7 +78,7 @@ class CheckpointFile:
 
 
 def newest_checkpoint(path: Path) -> Checkpoint | None:
-    """The newest whole checkpoint in the file, as another process sees it; None where there is none now."""
+    """Returns the newest complete checkpoint in the file, for another process; None if there is none."""
     size = _HEAD_BYTES + MAX_BYTES
     try:
         fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)

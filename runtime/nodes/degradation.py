@@ -1,9 +1,9 @@
-"""What perceive leaves out when time is short, in steps with hysteresis, so that planners get it in time.
+"""Load shedding of perceive in modes, with hysteresis.
 
     full -> rate (networks on fewer frames) -> boxes (the detector alone) -> odometry (no network) -> coasting
 
-In `coasting` most frames are not looked at: predicted, with a growing covariance, invalid after a while. Each mode
-but the first is a status in the measurements, and so in the estimate.
+In `coasting` most frames are predicted with a growing covariance, and the estimate becomes invalid after
+`coast_max_ms`. Each mode but the first is a status in the measurements and in the estimate.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from birdslam.types import Status
 
 
 class Mode(enum.StrEnum):
-    """From everything to almost nothing."""
+    """From full processing to prediction."""
 
     FULL = "full"
     RATE = "rate"
@@ -31,12 +31,12 @@ STATUS = {
     Mode.RATE: (Status.DEGRADED_RATE,),
     Mode.BOXES: (Status.DEGRADED_BOXES,),
     Mode.ODOMETRY: (Status.DEGRADED_ODOMETRY,),
-    Mode.COASTING: (Status.DEGRADED_ODOMETRY,),  # of those frames that are looked at
+    Mode.COASTING: (Status.DEGRADED_ODOMETRY,),  # of the frames that are processed
 }
 
 
 def modes(roles: Collection[str]) -> tuple[Mode, ...]:
-    """Those that make a difference, given the roles for which there are networks."""
+    """Returns the modes that have an effect, given the roles for which there are networks."""
     out = [Mode.FULL]
     if roles:
         out += [Mode.RATE, *([Mode.BOXES] if {"detector", "segmenter"} <= set(roles) else []), Mode.ODOMETRY]
@@ -44,7 +44,7 @@ def modes(roles: Collection[str]) -> tuple[Mode, ...]:
 
 
 class Degradation:
-    """Judges each frame's age when its measurements are done against the budget of that point."""
+    """Selects the mode by comparing each frame's age, when its measurements are done, with its budget."""
 
     def __init__(self, config: DegradationConfig, roles: Collection[str], budget_ms: float) -> None:
         self._config = config
@@ -56,11 +56,11 @@ class Degradation:
 
     @property
     def mode(self) -> Mode:
-        """For the next frame."""
+        """The mode of the next frame."""
         return self._modes[self._at]
 
     def judge(self, age_ms: float) -> bool:
-        """One frame more; whether the mode has changed."""
+        """Adds a frame's age; returns whether the mode has changed."""
         config = self._config
         self._late.append(age_ms > self._budget_ms)
         self._calm = self._calm + 1 if age_ms <= config.calm_share * self._budget_ms else 0

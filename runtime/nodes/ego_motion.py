@@ -1,4 +1,4 @@
-"""The odometry that a drive is given in place of the images' own."""
+"""External odometry in place of visual odometry."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from birdslam.sources.speed_file import of_sequence
 
 
 def external_odometry(configuration: Configuration, camera: Camera, name: str = "") -> ExternalOdometry | None:
-    """Of the file that is configured, in a directory that of the recording's `name`; None: the images' own.
+    """Returns the odometry of the configured file, or None if there is none.
 
-    Raises DatasetError for a file that can't be read.
+    In a configured directory it reads the file of the recording's `name`. Raises DatasetError for an unreadable file.
     """
     if not configuration.source.odometry:
         return None

@@ -1,4 +1,4 @@
-"""The networks on threads of their own: side by side, never two runs of one at once, and awaited to a deadline."""
+"""Runs the networks concurrently on threads, one run per network at a time, and waits for them until a deadline."""
 
 from __future__ import annotations
 
@@ -33,28 +33,27 @@ from birdslam.types import Frame
 
 Run = Callable[..., Any]
 
-# Of a multi-task network: vehicles that come with bodies are placed by these, and no map is asked (pseudolidar.py)
+# Output of a multi-task network that is not needed if its bodies place the vehicles (pseudolidar.py)
 UNREAD_WITH_BODIES = ("depth",)
-APART = ("segmentation",)  # of a multi-task network, what not every look needs
-BOXES = "boxes alone"  # such a look, among what is measured
-LANES_SPARING = 2  # lanes are found half as often at the least: a run takes the interpreter 20 ms from the frames
+APART = ("segmentation",)  # outputs of a multi-task network that some runs omit
+BOXES = "boxes alone"  # name of the run without them in the timings
+MAX_LANE_SLOWDOWN = 2  # lane detection runs at least half as often as scheduled
 
 log = logging.getLogger(__name__)
 
 
 def source_detections(configuration: Configuration) -> dict[int, Detections] | None:
-    """Frame -> another detector's boxes of the file that is configured; None: there is none. Raises DatasetError."""
+    """Returns the boxes of the configured file by frame; None if none is configured. Raises DatasetError."""
     source = configuration.source
     return read_detection_file(Path(source.detections).expanduser(), source.detector) if source.detections else None
 
 
 class Inference(Closing):
-    """The configured networks, checked against their manifests and warm. A context manager.
+    """The configured networks, checked against their manifests and warmed up. A context manager.
 
-    At rate "max" every network is awaited, so that a run can be repeated. Else a frame waits for those that are worth
-    it (`ModelSpec.awaited`) until its deadline, which counts from its capture: a frame that comes late waits less, and
-    the delay does not grow. What is not there by then is carried, with its age. Nor does a frame wait for the lanes
-    then, which come with a later one. Raises perception.ModelError.
+    At rate "max" a frame waits for every network, so that runs are reproducible. Otherwise it waits for the networks
+    with `ModelSpec.awaited` until its deadline after capture; later results go with a later frame, with their age, and
+    so do the lanes. Raises perception.ModelError.
     """
 
     def __init__(self, configuration: Configuration) -> None:
@@ -64,7 +63,7 @@ class Inference(Closing):
         most_threads = threads_of_a_network(usable_cores()) if self._adapts else None
         pointnet = configuration.models.pointnet
         unread = UNREAD_WITH_BODIES if pointnet is None else ()
-        chosen = any(spec.every is not None for spec in specs.values())  # by the user: nothing is to be adapted
+        chosen = any(spec.every is not None for spec in specs.values())  # by the user: no adaptation
         boxes = source_detections(configuration)
         if boxes is not None:
             specs.pop("detector", None)
@@ -78,13 +77,15 @@ class Inference(Closing):
         self._specs = specs
         self._lanes_every = schedule.lanes.every or 1
         self.frustum_network: PointNet | None = None if pointnet is None else load_pointnet(pointnet)
-        self.completion: GridCompletion | None = None  # of lane grids, where there are lanes to see
+        self.completion: GridCompletion | None = None  # of lane grids
         if configuration.models.completion and any("segmenter" in ROLES.get(h.role, (h.role,)) for h in heads):
             self.completion = shipped_completion(configuration.slam.frontend.lanes.shape)
         self._deadline_ns = configuration.deadline_ns
-        # What a frame has of its budget, with as much left over as lets a mode of degradation end
+        # Within this share of the budget a mode of degradation can end
         self._budget_ns = round(configuration.budgets.perceived_ms * configuration.degradation.calm_share * 1e6)
-        self._after_ns: deque[int] = deque(maxlen=looks.window_frames)  # what frames took when they had waited
+        self._after_ns: deque[int] = deque(
+            maxlen=looks.window_frames
+        )  # from the end of the wait to the end of the frame
         self._resumed_ns: int | None = None
         self._awaited: set[Run] = {head.run for head in heads if head.schedule.awaited}
         many = next((head for head in heads if head.role in ROLES), None)
@@ -93,7 +94,7 @@ class Inference(Closing):
             self._awaited.add(self._boxes_alone)
         self._rate_divisor = configuration.degradation.rate_divisor
         self._ran_frame = -self._rate_divisor  # the last frame that networks were offered
-        self._started: list[Future[Any]] = []  # for the frame at hand, and awaited
+        self._started: list[Future[Any]] = []  # awaited runs of the current frame
         self._threads = ThreadPoolExecutor(max(1, len(heads)), "network", initializer=realtime.below_frames)
         self._behind = ThreadPoolExecutor(max(1, len(heads)), "network-behind", initializer=realtime.lower_priority)
         self._beside = ThreadPoolExecutor(1, "beside", initializer=realtime.as_frames)
@@ -112,7 +113,7 @@ class Inference(Closing):
     def _computed_by(
         specs: dict[str, ModelSpec], configuration: Configuration, most_threads: int | None
     ) -> dict[str, ModelSpec]:
-        """Each network with what computes it. At rate "max" nothing is measured, so that a run repeats."""
+        """Selects the provider of each network; at rate "max" the CPU, so that runs are reproducible."""
         from birdslam.perception.session import providers_here
 
         asked, here = configuration.perceive.provider, ("cpu",) if configuration.lossless else providers_here()
@@ -120,15 +121,15 @@ class Inference(Closing):
 
     def _submit(self, run: Run, *arguments: Any) -> Future[Any]:
         if run not in self._awaited and self._deadline_ns is not None:
-            return self._behind.submit(run, *arguments)  # no frame waits for it: frames go first
+            return self._behind.submit(run, *arguments)  # at a lower priority: no frame waits for it
         future = self._threads.submit(run, *arguments)
         self._started.append(future)
         return future
 
     def fit(self, camera: Camera | None, perceive: PerceiveConfig, measured_s: float) -> LookRate | None:
-        """Measures the networks for `measured_s` and chooses for this computer how often they look, and who is awaited.
+        """Times the networks for `measured_s` and selects their rate and which of them frames wait for.
 
-        None where nothing is to be chosen: at rate "max", or where the user has said on which frames a network runs.
+        Returns None at rate "max", or if the user configured on which frames a network runs.
         """
         heads, period_ms = self.networks.heads, perceive.period_ms
         if not (self._adapts and heads) or any(self._specs[head.role].every is not None for head in heads):
@@ -149,37 +150,37 @@ class Inference(Closing):
             if self._specs[head.role].awaited is None and took_ms[head.role] > perceive.looks.awaited_share * period_ms:
                 self._awaited -= {head.run, *((self._boxes_alone,) if head.role in ROLES and self._boxes_alone else ())}
         rate = LookRate(perceive.looks, costs, usable_cores(), period_ms)
-        self.look_as(rate)
+        self.set_rate(rate)
         log.info("%s", rate.describe(costs, {head.role for head in heads if head.run in self._awaited}))
         return rate
 
-    def look_as(self, rate: LookRate) -> None:
-        """From now on the networks look as often as this says."""
+    def set_rate(self, rate: LookRate) -> None:
+        """Sets how often the networks run."""
         self.networks.slowdown, self.networks.masks_every = rate.sparing, rate.masks_every
 
     @property
-    def aside(self) -> Run | None:
-        """Runs a function on a thread of its own; None at rate "max", where nothing may depend on the clock.
+    def run_in_background(self) -> Run | None:
+        """Runs a function on a background thread; None at rate "max", where nothing may depend on the clock.
 
-        It begins when the frame at hand is over: it would take the interpreter's lock from what goes out. A frame that
-        comes meanwhile it lets pass, where it calls `yield_core`.
+        The function starts after the current frame, so that it does not hold the interpreter's lock while the frame is
+        processed. It yields to a new frame where it calls `yield_core`.
         """
-        return None if self._deadline_ns is None else self._run_aside
+        return None if self._deadline_ns is None else self._submit_background
 
     def yield_core(self) -> None:
-        """Waits for the end of the frame at hand, if there is one."""
+        """Waits for the end of the current frame."""
         if self._deadline_ns is not None:
             self._frame_over.wait()
 
-    def _run_aside(self, run: Run, *arguments: Any) -> Future[Any]:
-        def when_over() -> Any:
+    def _submit_background(self, run: Run, *arguments: Any) -> Future[Any]:
+        def run_after_frame() -> Any:
             self.yield_core()
             return run(*arguments)
 
-        return self._beside.submit(when_over)
+        return self._beside.submit(run_after_frame)
 
-    def over(self) -> None:
-        """What the frame at hand gave is sent."""
+    def finish_frame(self) -> None:
+        """Marks the current frame as sent."""
         self._frame_over.set()
         if self._resumed_ns is not None:
             self._after_ns.append(time.monotonic_ns() - self._resumed_ns)
@@ -187,22 +188,22 @@ class Inference(Closing):
 
     @property
     def lane_head(self) -> LaneHead:
-        """Lanes, on their schedule; half as often where the networks look less often than on theirs."""
+        """The lane head, on its schedule; half as often if the networks run at a reduced rate."""
         return LaneHead(
             self.completion,
-            self.aside,
+            self.run_in_background,
             self._lanes_every,
-            lambda: min(self.networks.slowdown, LANES_SPARING),
+            lambda: min(self.networks.slowdown, MAX_LANE_SLOWDOWN),
             self.yield_core,
         )
 
     @property
     def roles(self) -> frozenset[str]:
-        """Those that a network fills."""
+        """Roles of the networks."""
         return frozenset(head.role for head in self.networks.heads)
 
     def start(self, frame: Frame, mode: Mode = Mode.FULL) -> Pending:
-        """Starts the networks that are due on a frame, and that the mode allows."""
+        """Starts the networks that are due on a frame and that the mode allows."""
         self._started = []
         self._frame_over.clear()
         if mode in (Mode.ODOMETRY, Mode.COASTING):
@@ -223,9 +224,9 @@ class Inference(Closing):
         return _UntilDeadline(pending, self._started, frame.t_capture_ns + self._patience_ns(), self._resume)
 
     def _patience_ns(self) -> int:
-        """From its capture on, how long a frame waits: no longer than what comes after leaves of its budget.
+        """Returns how long a frame waits after its capture: its budget less the mean time of the steps that follow.
 
-        A slow computer would wait for networks to the deadline, be late with each frame for it, and leave networks out.
+        Without this limit a slow computer waits until the deadline, is late with every frame, and degrades.
         """
         assert self._deadline_ns is not None
         if not (self._adapts and self._after_ns):
@@ -236,7 +237,7 @@ class Inference(Closing):
         self._resumed_ns = time.monotonic_ns()
 
     def close(self) -> None:
-        """Ends the threads, after the runs at hand."""
+        """Ends the threads after their current runs."""
         self._frame_over.set()
         self._beside.shutdown(wait=True, cancel_futures=True)
         self._behind.shutdown(wait=True, cancel_futures=True)
@@ -245,7 +246,7 @@ class Inference(Closing):
 
 @dataclass(frozen=True)
 class _BoxesOnly:
-    """A pending perception whose road and lanes are too old to be used."""
+    """A pending perception without the segmentation, which is too old to be used."""
 
     pending: Pending
 
@@ -257,12 +258,12 @@ class _BoxesOnly:
 
 @dataclass(frozen=True)
 class _UntilDeadline:
-    """A pending perception that is awaited until a deadline; what is ready then is used."""
+    """A pending perception that is awaited until a deadline; later results are not used."""
 
     pending: Pending
     awaited: list[Future[Any]]
     deadline_ns: int  # CLOCK_MONOTONIC
-    resumed: Callable[[], None]  # called when the wait is over
+    resumed: Callable[[], None]  # called after the wait
 
     def result(self) -> Perception:
         wait(self.awaited, timeout=max(0.0, (self.deadline_ns - time.monotonic_ns()) / 1e9))

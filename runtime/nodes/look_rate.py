@@ -51,9 +51,9 @@ def measure(
         run(image)
         until_s, took_ms = time.monotonic() + within_s / len(runs), list[float]()
         while len(took_ms) < MIN_RUNS or time.monotonic() < until_s:
-            begun_s = time.perf_counter()
+            start_s = time.perf_counter()
             run(image)
-            took_ms.append((time.perf_counter() - begun_s) * 1e3)
+            took_ms.append((time.perf_counter() - start_s) * 1e3)
         out[name] = statistics.median(took_ms)
     return out
 

@@ -1,4 +1,4 @@
-"""A node's own statistics, published once a second as its health (wire.Health)."""
+"""Statistics of a node, published once a second as its health (wire.Health)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PERIOD_NS = 1_000_000_000
 
 
 class Meter:
-    """Counts and measures the frames of one node; of fixed size, whatever the drive."""
+    """Counts and times the frames of one node, in constant memory."""
 
     def __init__(self, node: str, configuration: Configuration, assignment: Assignment) -> None:
         self.frames = 0
@@ -32,13 +32,13 @@ class Meter:
         self._frames_reported = 0
 
     def received(self, now_ns: int) -> None:
-        """Something came in."""
+        """Records the time of the last input."""
         self._received_ns = now_ns
 
     def frame(self, t_capture_ns: int, trace: Trace) -> None:
-        """A frame is done; `trace` is what brought it, and this node's own stage.
+        """Adds a finished frame; the last stage of `trace` is this node's.
 
-        The wait in this node's queue counts against this node's budget: it was busy with another frame.
+        The wait in this node's queue counts against its budget.
         """
         self.frames += 1
         own = trace.stages[-1]
@@ -51,11 +51,11 @@ class Meter:
         self._overruns += (done_ns - arrived_ns) / 1e6 > self._budget_ms
 
     def due(self, now_ns: int) -> bool:
-        """Whether a second has passed."""
+        """Whether a health is due."""
         return now_ns - self._reported_ns >= PERIOD_NS
 
     def health(self, now_ns: int, mode: str, counters: dict[str, int]) -> Health:
-        """The health to publish now."""
+        """Returns the health to publish now."""
         rate_hz = (self.frames - self._frames_reported) * 1e9 / (now_ns - self._reported_ns)
         self._reported_ns, self._frames_reported = now_ns, self.frames
         return Health(

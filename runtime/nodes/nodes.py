@@ -1,7 +1,7 @@
-"""What the three processes do; thin, since each holds its objects of birdslam/ and only moves records in and out.
+"""The nodes: they move records between the bus and their objects of birdslam/.
 
-A node receives (`receive`, in bounded time), and makes records of what it received (`step`, a generator: the runner
-sends each as soon as it is there). It has `ended` once END_OF_SOURCE went through it.
+`receive` waits for a bounded time; `step` is a generator of records, and the runner sends each at once. A node has
+`ended` after END_OF_SOURCE.
 """
 
 from __future__ import annotations
@@ -30,36 +30,36 @@ from birdslam.runtime.transport.presence import ring_path
 from birdslam.runtime.transport.ring import FrameReader
 from birdslam.types import INVALIDATING, Attitude, Frame, FrameRef, Measurements, Status
 
-WAITING_FRAMES = 8  # that come while perceive is at one are predicted, all but the newest; more are dropped
-STALE_BUDGETS = 3.0  # a frame that comes to perceive this many times later than budgeted bears INPUT_STALE
+WAITING_FRAMES = 8  # queue of perceive: all but the newest are predicted, more are dropped
+STALE_BUDGET_RATIO = 3.0  # a frame that arrives this many times later than budgeted gets INPUT_STALE
 
 log = logging.getLogger(__name__)
 
 
 class Node(Protocol):
-    """What the runner drives."""
+    """The interface that the runner calls."""
 
     ended: bool
 
     @property
     def mode(self) -> str:
-        """For its health."""
+        """The mode, for the node's health."""
 
     def receive(self, timeout_s: float) -> Message | None: ...
 
     def step(self, record: Any) -> Iterator[msgspec.Struct]: ...
 
     def drain(self) -> None:
-        """Lets the source end here; only capture can."""
+        """Ends the source here; only capture does."""
 
     def counters(self) -> dict[str, int]:
-        """`dropped`, `malformed` and `torn` since the start (see wire.Health)."""
+        """Returns `dropped`, `malformed` and `torn` since the start (see wire.Health)."""
 
     def close(self) -> None: ...
 
 
 def calibrated(configuration: Configuration) -> Camera:
-    """The camera, which the supervisor has filled in from the source."""
+    """Returns the camera, which the supervisor has filled in from the source."""
     if configuration.camera is None:
         raise ConfigurationError("camera: none is configured")
     return configuration.camera
@@ -74,7 +74,7 @@ class PerceiveNode:
         self.ended = False
         degrades = configuration.degradation.enabled and not configuration.lossless
         self._frames = bus.subscriber("frame", WAITING_FRAMES if degrades else None)
-        self._waiting: deque[Message] = deque()  # frames that have come, behind the one at hand
+        self._waiting: deque[Message] = deque()  # received frames after the current one
         self._ring = FrameReader(ring_path(configuration.vehicle, configuration.runtime_dir))
         self._inference = inference
         self._frontend = frontend
@@ -84,16 +84,16 @@ class PerceiveNode:
             budget_ms = configuration.budgets.perceived_ms
             self._degradation = Degradation(configuration.degradation, inference.roles, budget_ms)
         perceive = configuration.perceive
-        # A node restarted is awaited: it looks at its networks for as short a time as it can
+        # The other nodes wait for a restarted node: skip the timing
         measured_s = 0.0 if assignment.restarts else perceive.looks.measured_s
         self._look_rate = inference.fit(configuration.camera, perceive, measured_s)
-        self._last_frame: int | None = None  # that came
+        self._last_frame: int | None = None  # last received
         self._coast_divisor = configuration.degradation.coast_divisor
         self._coast_max_ns = round(configuration.degradation.coast_max_ms * 1e6)
-        self._stale_ns = round(configuration.budgets.received_ms * STALE_BUDGETS * 1e6)
-        self._looked_frame = -1  # the last frame with pixels that was looked at
-        self._measured_ns: int | None = None  # the source time of the last one whose motion was measured
-        self._looked_invalid: tuple[Status, ...] = ()  # what made it one that nobody may drive by
+        self._stale_ns = round(configuration.budgets.received_ms * STALE_BUDGET_RATIO * 1e6)
+        self._looked_frame = -1  # the last processed frame with pixels
+        self._measured_ns: int | None = None  # source time of the last frame with measured ego motion
+        self._looked_invalid: tuple[Status, ...] = ()  # its invalidating statuses
         self._looked_attitude = Attitude()
 
     @property
@@ -101,7 +101,7 @@ class PerceiveNode:
         return Mode.FULL if self._degradation is None else self._degradation.mode
 
     def receive(self, timeout_s: float) -> Message | None:
-        """The next frame, while `_waiting` has those that came after it."""
+        """Returns the next frame; `_waiting` holds the frames after it."""
         message = self._frames.recv(0.0 if self._waiting else timeout_s)
         while message is not None:
             self._waiting.append(message)
@@ -110,11 +110,11 @@ class PerceiveNode:
 
     @property
     def _overtaken(self) -> bool:
-        """Whether a newer frame waits already: the one at hand is predicted, since there is time for one of them."""
+        """Whether a newer frame is already waiting; the current one is then predicted."""
         return any(Status.END_OF_SOURCE not in message.record.status for message in self._waiting)
 
     def step(self, ref: FrameRef) -> Iterator[Measurements]:
-        begun_ns = time.monotonic_ns()
+        start_ns = time.monotonic_ns()
         if Status.END_OF_SOURCE in ref.status:
             self.ended = True
             yield Measurements(**stamps(ref), status=ref.status)
@@ -125,7 +125,7 @@ class PerceiveNode:
         image = None
         if ref.slot >= 0:
             image = self._ring.read(ref)
-            if image is None:  # overwritten meanwhile: the next frame says FRAMES_DROPPED
+            if image is None:  # overwritten meanwhile: the next frame gets FRAMES_DROPPED
                 self._torn += 1
                 return
         frame = Frame(**stamps(ref), image=image, status=ref.status, speeds=ref.speeds)
@@ -134,19 +134,19 @@ class PerceiveNode:
         else:
             mode = self._degradation.mode
             yield self._coast(ref) if self._coasts(ref, mode) else self._look(frame, mode)
-        self._inference.over()
+        self._inference.finish_frame()
         now_ns = time.monotonic_ns()
-        self._keep_pace(ref.frame_id, (now_ns - begun_ns) / 1e6)
+        self._adapt_rate(ref.frame_id, (now_ns - start_ns) / 1e6)
         if self._degradation is not None and self._degradation.judge((now_ns - ref.t_capture_ns) / 1e6):
             log.warning("frame %d: mode %s after %s", ref.frame_id, self._degradation.mode, mode)
 
-    def _keep_pace(self, frame_id: int, step_ms: float) -> None:
-        """Networks that look less often where frames were left out, and more often once there is time."""
+    def _adapt_rate(self, frame_id: int, step_ms: float) -> None:
+        """Reduces the rate of the networks after dropped frames, and raises it when there is time."""
         dropped = self._last_frame is not None and frame_id > self._last_frame + 1
         self._last_frame = frame_id
         if self._look_rate is not None and self._look_rate.judge(step_ms, dropped):
-            self._inference.look_as(self._look_rate)
-            log.info("frame %d: networks look %d times less often than they would", frame_id, self._look_rate.sparing)
+            self._inference.set_rate(self._look_rate)
+            log.info("frame %d: networks run at 1/%d of their scheduled rate", frame_id, self._look_rate.sparing)
 
     def _look(self, frame: Frame, mode: Mode) -> Measurements:
         stale = time.monotonic_ns() - frame.t_capture_ns > self._stale_ns
@@ -162,7 +162,7 @@ class PerceiveNode:
         return msgspec.structs.replace(measurements, status=tuple(dict.fromkeys(status)))
 
     def _coasts(self, ref: FrameRef, mode: Mode) -> bool:
-        """Whether there is no time to look at this frame."""
+        """Whether this frame is predicted for lack of time."""
         return mode is Mode.COASTING and ref.slot >= 0 and ref.frame_id - self._looked_frame < self._coast_divisor
 
     def _coast(self, ref: FrameRef) -> Measurements:
@@ -170,12 +170,12 @@ class PerceiveNode:
         return Measurements(**stamps(ref), status=tuple(dict.fromkeys(status)), attitude=self._looked_attitude)
 
     def _too_long(self, t_source_ns: int) -> tuple[Status, ...]:
-        """Whether the motion has only been predicted for longer than anybody should drive by."""
+        """Returns COASTED_TOO_LONG if the ego motion was last measured more than `coast_max_ms` ago."""
         since_ns = 0 if self._measured_ns is None else t_source_ns - self._measured_ns
         return (Status.COASTED_TOO_LONG,) if since_ns > self._coast_max_ns else ()
 
     def drain(self) -> None:
-        """Ends with END_OF_SOURCE, as ever."""
+        """Does nothing: perceive ends with END_OF_SOURCE."""
 
     def counters(self) -> dict[str, int]:
         frames, looks = self._frames, self._inference.networks.looks
@@ -187,7 +187,7 @@ class PerceiveNode:
 
 
 def front_end(configuration: Configuration, inference: Inference) -> FrontEnd:
-    """As perceive has it."""
+    """Returns the front end of perceive."""
     camera = calibrated(configuration)
     return FrontEnd(
         camera,
@@ -199,7 +199,7 @@ def front_end(configuration: Configuration, inference: Inference) -> FrontEnd:
 
 
 def prepare(name: str, configuration: Configuration) -> Callable[[Bus, Callable[[float], object], Assignment], Node]:
-    """Does what takes long and what several processes may do at once; the result makes the node without delay."""
+    """Does the slow part of the start, which processes can do in parallel; the result builds the node at once."""
     if name == "perceive":
         cv2.setNumThreads(configuration.perceive.opencv_threads)
         inference = Inference(configuration)

@@ -1,4 +1,4 @@
-"""What the optimize process does: measurements into the pose graph, estimates out of it, for every frame in time."""
+"""The optimize process: adds measurements to the pose graph and publishes an estimate of every frame in time."""
 
 from __future__ import annotations
 
@@ -36,10 +36,9 @@ log = logging.getLogger(__name__)
 class OptimizeNode:
     """Measurements -> Estimate, MapUpdate: the pose graph.
 
-    Frame numbers never fall: measurements that come after their frame was given up correct the graph, and the newest
-    frame that was reported is reported again. After a restart the graph goes on from its last checkpoint, with what
-    perceive still has of the measurements since (GRAPH_RESTORED); or, where these do not reach back to it, in a new
-    epoch (GRAPH_RESET).
+    Frame numbers never decrease: measurements that arrive after their frame was predicted correct the graph, and the
+    newest published frame is published again. After a restart the graph is restored from its last checkpoint and the
+    later measurements that perceive retains (GRAPH_RESTORED); without them it starts a new epoch (GRAPH_RESET).
     """
 
     def __init__(self, configuration: Configuration, bus: Bus, assignment: Assignment = FIRST) -> None:
@@ -48,27 +47,27 @@ class OptimizeNode:
         self._pending = PendingFrames(deadline_ns(configuration))
         self._frames = None if configuration.lossless else bus.subscriber("frame", PENDING_FRAMES)
         self._coast_max_ns = round(configuration.degradation.coast_max_ms * 1e6)
-        self._last: Estimate | None = None  # that rests on measurements
-        self._coasted: FrameRef | None = None  # the newest frame that was given up
+        self._last: Estimate | None = None  # from measurements
+        self._coasted: FrameRef | None = None  # the newest predicted frame
         self._coasted_frames = self._outrun = 0
         self._reported_frame = -1 if assignment.resume is None else assignment.resume.next_frame - 1
-        self._reported_before = self._reported_frame  # by the process before this one
+        self._reported_before = self._reported_frame  # by the previous process
         self._missed: deque[Message] = deque()  # measurements since the checkpoint
-        self._missed_frame = -1  # the last of them
+        self._missed_frame = -1  # the last frame among them
         self._epochs: EpochFile | None = None
         self._checkpoints: CheckpointFile | None = None
         self._checkpoint_ns, self._due_ns = round(configuration.runtime.checkpoint_ms * 1e6), 0
-        if not configuration.lossless:  # a run at rate "max" gives the same bytes each time
+        if not configuration.lossless:  # a run at rate "max" is reproducible
             directory = runtime_dir_of(configuration.vehicle, configuration.runtime_dir)
             self._epochs = EpochFile(directory / "epoch")
             self._checkpoints = CheckpointFile(checkpoint_path(configuration))
         epoch = 0 if self._epochs is None else self._epochs.last + 1
-        self._unreported = (Status.GRAPH_RESET,) if epoch else ()  # planners may know an older world
+        self._unreported = (Status.GRAPH_RESET,) if epoch else ()  # planners may hold poses of an older epoch
         restored = self._restored(configuration, bus, assignment)
         self._graph = restored or PoseGraph(configuration.slam.graph, configuration.slam.weights, epoch)
 
     def _restored(self, configuration: Configuration, bus: Bus, assignment: Assignment) -> PoseGraph | None:
-        """The graph of the last checkpoint of this run, if its epoch is still the newest that planners know of."""
+        """Restores the graph of this run's last checkpoint, if no newer epoch was published."""
         if self._checkpoints is None or self._epochs is None:
             return None
         for checkpoint in self._checkpoints.take():
@@ -77,7 +76,7 @@ class OptimizeNode:
             try:
                 graph = PoseGraph.restore(checkpoint.data, configuration.slam.graph, configuration.slam.weights)
             except CheckpointError as error:
-                log.warning("the checkpoint of frame %d is of no use: it %s", checkpoint.frame_id, error)
+                log.warning("the checkpoint of frame %d is unusable: it %s", checkpoint.frame_id, error)
                 continue
             wait_s = configuration.runtime.catch_up_ms / 1e3
             if not bus.wait_alive({"perceive"}, wait_s):
@@ -86,7 +85,7 @@ class OptimizeNode:
             if self._missed:
                 self._missed_frame = self._missed[-1].record.frame_id
             log.warning(
-                "goes on from the checkpoint of frame %d, with %d since", checkpoint.frame_id, len(self._missed)
+                "restored the checkpoint of frame %d and %d later frames", checkpoint.frame_id, len(self._missed)
             )
             self._unreported = (Status.GRAPH_RESTORED,)
             return graph
@@ -101,7 +100,7 @@ class OptimizeNode:
         return self._coasted is not None and self._coasted.frame_id == self._reported_frame
 
     def receive(self, timeout_s: float) -> Message | None:
-        """The next measurements; or the frame whose measurements are overdue by now."""
+        """Returns the next measurements, or the frame whose measurements are overdue."""
         if self._missed:
             return self._missed.popleft()
         until_s = time.monotonic() + timeout_s
@@ -110,7 +109,7 @@ class OptimizeNode:
             left_s = max(0.0, until_s - time.monotonic())
             message = self._measurements.recv(min(left_s, self._pending.wait_s(time.monotonic_ns())))
             if message is not None and message.record.frame_id <= self._missed_frame:
-                continue  # taken up already
+                continue  # already added
             if message is not None:
                 self._pending.answered(message.record.frame_id)
                 return message
@@ -134,7 +133,7 @@ class OptimizeNode:
             return
         estimate = self._last = self._graph.optimise(record)
         if estimate.frame_id <= self._reported_before:
-            self._graph.map_update()  # reported as well
+            self._graph.map_update()  # published before the restart
             return
         if estimate.frame_id >= self._reported_frame:
             yield self._report(estimate)
@@ -146,21 +145,21 @@ class OptimizeNode:
         gained = self._graph.map_update()
         if gained is not None:
             yield gained
-        self._keep(record.frame_id)  # when all is sent, so that nobody waits for it
+        self._keep(record.frame_id)  # after the records are sent, so that it delays none
 
     def _keep(self, frame_id: int) -> None:
-        """A checkpoint, when one is due."""
+        """Stores a checkpoint if one is due."""
         now_ns = time.monotonic_ns()
         if self._checkpoints is not None and now_ns >= self._due_ns:
             self._checkpoints.store(frame_id, self._graph.epoch, self._graph.checkpoint())
             self._due_ns = now_ns + self._checkpoint_ns
 
     def _coast(self, ref: FrameRef) -> Estimate:
-        """Of a frame without measurements; the graph stays as it is."""
+        """Predicts a frame without measurements; the graph does not change."""
         return self._graph.optimise(unmeasured(ref, self._last, self._coast_max_ns))
 
     def _report(self, estimate: Estimate) -> Estimate:
-        """The estimate to publish, with the statuses that planners were not sent yet."""
+        """Returns the estimate to publish, with the statuses that were not published yet."""
         estimate, self._unreported = with_unreported(estimate, self._unreported), ()
         self._reported_frame = estimate.frame_id
         if self._epochs is not None:
@@ -168,14 +167,14 @@ class OptimizeNode:
         return estimate
 
     def _end(self, measurements: Measurements) -> Iterator[Estimate | MapUpdate]:
-        """The map is complete before the estimate that ends the run; its update has the frame id of the end."""
+        """Completes the map, with the frame id of the end, before the estimate that ends the run."""
         epoch = self._graph.epoch
         gained = self._graph.map_update() or MapUpdate(epoch=epoch, frame_id=measurements.frame_id)
         yield msgspec.structs.replace(gained, frame_id=measurements.frame_id)
         yield end_estimate(measurements, epoch, self._last)
 
     def drain(self) -> None:
-        """Ends with END_OF_SOURCE, as ever."""
+        """Does nothing: optimize ends with END_OF_SOURCE."""
 
     def counters(self) -> dict[str, int]:
         taken = self._measurements
@@ -183,11 +182,11 @@ class OptimizeNode:
         return {"dropped": taken.dropped, "malformed": taken.malformed, **counted}
 
     def close(self) -> None:
-        """Holds nothing open."""
+        """Does nothing."""
 
 
 def end_estimate(measurements: Measurements, epoch: int, last: Estimate | None) -> Estimate:
-    """The estimate that ends a run, after the last one."""
+    """Returns the estimate that ends a run, at the pose of the last one."""
     return Estimate(
         **stamps(measurements),
         epoch=epoch,

@@ -1,10 +1,8 @@
-"""The recorder: a process that subscribes and records the drive (recording/recording.py); no node waits for it.
+"""The recorder: a process that subscribes to all topics and records the drive (recording/recording.py).
 
-`python -m birdslam.runtime.nodes.recorder record VITALS_FD PARENT_PID`, on standard input the configuration as a line
-of JSON, then a `RecorderAssignment` as another. It ends when the end of the source has come through, or on SIGTERM.
-Exit status: 0 when the recording is complete; 2 where the file can't be made, 3 where the disk failed it, each with
-one ERROR line; 1 for a bug. One that died or stalled is restarted in a file of its own, which begins with the
-optimizer's graph, so that it can be replayed.
+`python -m birdslam.runtime.nodes.recorder record VITALS_FD PARENT_PID`; standard input: the configuration and a
+`RecorderAssignment`, one line of JSON each. Ends after END_OF_SOURCE or on SIGTERM. Exit status: 0 complete, 1 bug, 2
+the file can't be created, 3 disk failure. A restarted recorder writes a new file, which starts with the graph.
 """
 
 from __future__ import annotations
@@ -37,20 +35,20 @@ from birdslam.runtime.wire import Health
 from birdslam.sources.speed_log import added
 from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, SpeedReading, Status
 
-TURN_S = 0.05  # what has come is written at least so often
-TURN_MESSAGES = 256  # then it looks whether it is to end
-QUIET_S = 0.2  # at the end: nothing more has come for so long
+TURN_S = 0.05  # max. interval between two writes
+MAX_TURN_MESSAGES = 256  # written before it checks whether to end
+QUIET_S = 0.2  # without a message: the drive is over
 END_S = 2.0  # after END_OF_SOURCE, for the rest of the map
 HEALTH_NS = 1_000_000_000
-EVENTS = 256  # of liveliness that wait
-NICENESS = 5  # the pipeline goes first
-INDEX_MIB = 8.0, 8.0  # of objects and of larger blocks: the index of an hour, and chunks with images
+MAX_EVENTS = 256  # queue of liveliness events
+NICENESS = 5  # below the pipeline
+INDEX_MIB = 8.0, 8.0  # reserved for objects (the index of an hour) and for larger blocks (chunks with images)
 
 log = logging.getLogger(__name__)
 
 
 class RecorderAssignment(msgspec.Struct, frozen=True):
-    """Beside the configuration: the networks with their hashes, its file, and the recorder before it."""
+    """The networks with their hashes, the file to write, and the state of the previous recorder."""
 
     models: dict[str, Any]
     file: str
@@ -58,7 +56,7 @@ class RecorderAssignment(msgspec.Struct, frozen=True):
 
 
 class Recorder:
-    """From the bus into the file."""
+    """Writes messages from the bus to the file."""
 
     def __init__(
         self,
@@ -74,9 +72,9 @@ class Recorder:
         health = (f"health/{name}" for name in (*NODES, MAP.name))
         others = (*(topic for topic in EXACT if topic != "estimate"), *health, "map_pose")
         self._others = {topic: bus.subscriber(topic, config.queue) for topic in others}
-        self._next: dict[str, Message] = {}  # of each topic, where one waits
+        self._next: dict[str, Message] = {}  # the oldest unwritten message of each topic
         self._health = bus.publisher("health/record")
-        self._events: deque[tuple[int, Alive]] = deque(maxlen=EVENTS)
+        self._events: deque[tuple[int, Alive]] = deque(maxlen=MAX_EVENTS)
         bus.on_alive(lambda node, alive: self._events.append((time.monotonic_ns(), Alive(node=node, alive=alive))))
         self._ring: FrameReader | None = None
         if config.images:
@@ -87,13 +85,13 @@ class Recorder:
         self._process.cpu_percent()
         self._reported_ns, self._frames, self._frames_reported = time.monotonic_ns(), 0, 0
         self._end_frame: int | None = None  # of END_OF_SOURCE
-        self._end_measured = False  # the measurements of it have come: another link, which may be the slower one
+        self._end_measured = False  # its measurements have arrived, which may be later
         self._map_frame = -1
-        self._speeds: tuple[SpeedReading, ...] = ()  # that the last frame bore
+        self._speeds: tuple[SpeedReading, ...] = ()  # of the last frame
         self._estimate_frame = -1
-        self._handed: deque[tuple[int, int]] = deque()  # the file's length with them, and the frame that is next
-        self._missed = 0  # frames between the last on the disk of the recorder before this one, and this one's first
-        self._checkpoints: Path | None = None  # where a file that begins in the middle of a drive finds its graph
+        self._handed: deque[tuple[int, int]] = deque()  # length of the file, next frame
+        self._missed = 0  # frames between the previous recorder's last written one and this one's first
+        self._checkpoints: Path | None = None  # source of the graph in a file that starts in the middle of a drive
         if assignment.restarts:
             self._checkpoints = checkpoint_path(configuration)
         self._first_measured: int | None = None  # the frame of the first measurements in this file
@@ -101,9 +99,9 @@ class Recorder:
             self._draw(scene.from_camera(configuration.camera, time.time_ns()), time.monotonic_ns())
 
     def record_received(self, timeout_s: float) -> bool:
-        """Writes what has come, so many messages at the most; whether anything has.
+        """Writes up to MAX_TURN_MESSAGES messages in order of arrival; returns whether there were any.
 
-        In the order in which it came, with one message of each topic unpacked at a time: the rest waits as bytes.
+        It unpacks one message of each topic at a time.
         """
         if "estimate" not in self._next and (first := self._estimates.recv(timeout_s)) is not None:
             self._next["estimate"] = first
@@ -114,7 +112,7 @@ class Recorder:
         for topic in subscribers.keys() - self._next.keys():
             self._unpack_next(topic, subscribers[topic])
         written = 0
-        while self._next and written < TURN_MESSAGES:
+        while self._next and written < MAX_TURN_MESSAGES:
             oldest = min(self._next, key=lambda topic: self._next[topic].t_received_ns)
             self._take(oldest, self._next.pop(oldest))
             self._unpack_next(oldest, subscribers[oldest])
@@ -134,7 +132,7 @@ class Recorder:
             self._next[topic] = message
 
     def _show_life(self) -> None:
-        """After each message: those that waited while it had no core take long to write."""
+        """Updates the vitals after each message, since a full queue takes long to write."""
         self._vitals.count(frames=self._writer.messages)
         self._vitals.beat()
         if self._writer.flush_if_due(time.monotonic_ns()):
@@ -143,7 +141,7 @@ class Recorder:
             self._vitals.count(next_frame=self._handed.popleft()[1])
 
     def _begin_from_checkpoint(self, path: Path, first_frame: int, now_ns: int) -> None:
-        """As soon as there is one from which on all measurements are in this file."""
+        """Writes the first checkpoint after which the file has all measurements."""
         found = newest_checkpoint(path)
         if found is not None and found.frame_id >= first_frame - 1:
             checkpoint = GraphCheckpoint(frame_id=found.frame_id, epoch=found.epoch, data=found.data)
@@ -152,16 +150,16 @@ class Recorder:
 
     @property
     def over(self) -> bool:
-        """The end of the source, its measurements, and the map before it have been written."""
+        """Whether the end of the source, its measurements and the map have been written."""
         return self._end_frame is not None and self._end_measured and self._map_frame == self._end_frame
 
     @property
     def ending(self) -> bool:
-        """The end of the source has been written."""
+        """Whether the end of the source has been written."""
         return self._end_frame is not None
 
     def dropped(self) -> dict[str, int]:
-        """Messages that were pushed out of the queues unwritten, by topic."""
+        """Returns the number of messages dropped from full queues, by topic."""
         subscribers = {"estimate": self._estimates, **self._others}
         return {topic: subscriber.dropped for topic, subscriber in subscribers.items() if subscriber.dropped}
 
@@ -242,7 +240,7 @@ class Recorder:
         self._writer.draw("/health/record", health, now_ns)
 
     def end(self) -> dict[str, str]:
-        """Counts for the end of the file."""
+        """Returns the counts for the end of the file."""
         counts = {"estimates": self._frames, "images": self.images, "images_torn": self.torn, "missed": self._missed}
         counts |= self._counters()
         dropped = {f"dropped {topic}": n for topic, n in self.dropped().items()}
@@ -260,7 +258,7 @@ def _latency(estimate: Estimate, message: Message) -> Latency:
 
 
 def about(configuration: Configuration, models: dict[str, Any], restarts: int = 0) -> About:
-    """Of a recording that begins now."""
+    """Returns the metadata of a recording that starts now."""
     versions = library_versions()
     utc_offset_ns = time.time_ns() - time.monotonic_ns()
     return About(
@@ -273,14 +271,14 @@ def about(configuration: Configuration, models: dict[str, Any], restarts: int = 
 
 
 def record(configuration: Configuration, order: RecorderAssignment, vitals: Vitals, stop: Stop) -> int:
-    """A whole recording; the exit status of its process."""
+    """Records a drive; returns the exit status of the process."""
     realtime.reserve(*INDEX_MIB)
     config = configuration.recording
     described = about(configuration, order.models, order.assignment.restarts)
     try:
         writer = RecordingWriter(Path(order.file), described, configuration.camera, config.flush_ms, config.sync)
     except OSError as error:
-        log.error("%s can't be made: %s", order.file, error.strerror)
+        log.error("%s can't be created: %s", order.file, error.strerror)
         return USER_ERROR_STATUS
     with Bus(configuration.vehicle, RECORDER.name, runtime_dir=configuration.runtime_dir) as bus:
         recorder = Recorder(configuration, bus, writer, vitals, order.assignment)
@@ -299,7 +297,7 @@ def record(configuration: Configuration, order: RecorderAssignment, vitals: Vita
                 end_s = time.monotonic() + END_S
         while writer.error is None and not recorder.over and recorder.record_received(QUIET_S):
             pass
-        vitals.count(ready=0)  # no beat any more: it waits for the disk
+        vitals.count(ready=0)  # no more beats while it waits for the disk
         writer.close(recorder.end())
     if writer.error is not None:
         what = f"{writer.error.strerror}: {order.file} ends with what was written until then"

@@ -1,9 +1,8 @@
-"""The one loop of every node: receive, step, send, measure, beat.
+"""The loop of every node: receive, step, send, measure, beat.
 
-`python -m birdslam.runtime.nodes.runner NODE VITALS_FD PARENT_PID`, on standard input the configuration as a line of
-JSON, and then, when its work is to begin, its assignment as another: until then it is a spare. Exit status: 0 at the
-end of the source or when asked to end; 2 where what the user gave can't be used, with one ERROR line on stderr; 1
-where the node fails at work: a camera that is gone, or a bug, with its traceback there.
+`python -m birdslam.runtime.nodes.runner NODE VITALS_FD PARENT_PID`; standard input: the configuration as a line of
+JSON, later the assignment as another; until then the process is a spare. Exit status: 0 at the end of the source or
+on request; 1 failure at run time (camera lost, bug); 2 invalid input of the user.
 """
 
 from __future__ import annotations
@@ -40,13 +39,15 @@ from birdslam.types import Estimate, FrameRef, Measurements, Status
 log = logging.getLogger(__name__)
 
 USER_ERRORS = (ConfigurationError, DatasetError, ModelError, SourceError)
-BESIDE_PATIENCE_S = 0.2  # of a restarted node: longer than this its first records are not held back
-DOWNSTREAM = {"capture": "perceive", "perceive": "optimize", "optimize": "supervisor"}  # who must be there to receive
+BESIDE_PATIENCE_S = 0.2  # max. delay of a restarted node's first records
+DOWNSTREAM = {"capture": "perceive", "perceive": "optimize", "optimize": "supervisor"}  # node -> its receiver
 
 
 class Stop:
-    """The signals of the supervisor. SIGTERM: end after the step at hand (at once while still building). SIGINT: drain,
-    the source ends here and all frames in flight are processed.
+    """Handles the signals of the supervisor.
+
+    SIGTERM: end after the current step, or at once during the start. SIGINT: drain, that is, end the source and process
+    all frames in flight.
     """
 
     def __init__(self) -> None:
@@ -65,7 +66,7 @@ class Stop:
         os.eventfd_write(self._event, 1)
 
     def wait(self, timeout_s: float) -> bool:
-        """Sleeps to a deadline (exact to some 50 us), or until a signal; says whether one has come."""
+        """Sleeps for `timeout_s` (exact to about 50 us) or until a signal; returns whether one has arrived."""
         select.select([self._event], [], [], timeout_s)
         return self.draining
 
@@ -78,7 +79,7 @@ def run(
     vitals: Vitals,
     stop: Stop,
 ) -> None:
-    """One node from the beginning of its work to its end."""
+    """Builds a node and runs it to its end."""
     runtime = configuration.runtime
     with Bus(
         configuration.vehicle, name, runtime_dir=configuration.runtime_dir, lossless=configuration.lossless
@@ -88,10 +89,10 @@ def run(
             publishers = {TOPICS[topic].record: bus.publisher(topic) for topic in NODES[name].sends}
             _await_downstream(name, bus, publishers, runtime.ready_timeout_s)
             first_s = configuration.recording.ready_timeout_s
-            bus.wait_alive(_beside(configuration), BESIDE_PATIENCE_S if assignment.restarts else first_s)
+            bus.wait_alive(_observers(configuration), BESIDE_PATIENCE_S if assignment.restarts else first_s)
             realtime.freeze_objects()
             stop.at_work = True
-            vitals.beat()  # before it is ready: who is ready without a beat is stalled
+            vitals.beat()  # before `ready`: a node that is ready without a beat counts as stalled
             vitals.count(ready=1)
             bus.declare_alive()
             _loop(node, publishers, Meter(name, configuration, assignment), vitals, stop, configuration)
@@ -99,14 +100,14 @@ def run(
             node.close()
 
 
-def _beside(configuration: Configuration) -> set[str]:
-    """Who is to miss no frame at the beginning of a drive."""
+def _observers(configuration: Configuration) -> set[str]:
+    """Returns the processes that must receive the first frame of a drive."""
     there = {RECORDER.name: bool(configuration.recording.file), MAP.name: configuration.maps_live}
     return {name for name, is_there in there.items() if is_there}
 
 
 def _await_downstream(name: str, bus: Bus, publishers: dict[type, Publisher], timeout_s: float) -> None:
-    """Readiness goes upstream, supervisor to capture, so that the first frame finds everyone listening."""
+    """Waits for the receiver. Nodes become ready from supervisor to capture, so that all receive the first frame."""
     until_s = time.monotonic() + timeout_s
     missing = bus.wait_alive({DOWNSTREAM[name]}, timeout_s)
     main = publishers[TOPICS[NODES[name].sends[0]].record]
@@ -119,7 +120,7 @@ def _is_frame(record: msgspec.Struct) -> TypeGuard[FrameRef | Measurements | Est
 
 
 def _ends(record: msgspec.Struct) -> bool:
-    """Whether the record ends the run: without it, everybody behind would wait for more."""
+    """Whether the record ends the run."""
     return isinstance(record, FrameRef | Measurements | Estimate) and Status.END_OF_SOURCE in record.status
 
 
@@ -144,7 +145,7 @@ def _loop(
             overdue = isinstance(message.record, Overdue)
             if not overdue:
                 meter.received(taken_ns)
-            waits = message.trace.stages and not overdue  # in the queue of this node, which was at another record
+            waits = message.trace.stages and not overdue  # in the queue of this node
             arrived_ns = message.t_received_ns if waits else 0
             for record in node.step(message.record):
                 now_ns = time.monotonic_ns()
@@ -172,8 +173,8 @@ def main(arguments: list[str]) -> int:
         give_back_memory()
         vitals.count(prepared=1)
         line = sys.stdin.buffer.readline()
-        if line:  # else this spare is needed no more
-            realtime.reserve_for(name, configuration)  # a spare would hold it for nothing
+        if line:  # else the supervisor needs no spare any more
+            realtime.reserve_for(name, configuration)  # not in a spare
             for refused in realtime.apply(name, configuration):
                 log.warning("%s", refused)
             run(name, configuration, make, msgspec.json.decode(line, type=Assignment), vitals, stop)

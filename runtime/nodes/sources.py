@@ -1,4 +1,4 @@
-"""Frames of any source: opening it by its URI, pacing, reading ahead, and the one way from pixels to a `Frame`."""
+"""Sources of frames: opening by URI, pacing, reading ahead, and conversion to `Frame`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from birdslam.sources.speed_log import shifted
 from birdslam.types import Frame, Status
 
 REFUSALS = {  # key -> why a live camera may refuse it
-    "speed": "a speed file is for recordings; live the car says it on the bus",
+    "speed": "a speed file is for recordings; a live car publishes its speed on the bus",
     "odometry": "an odometry file is for recordings",
     "detections": "a file of boxes is for recordings",
 }
@@ -35,11 +35,11 @@ log = logging.getLogger(__name__)
 
 
 class SourceError(RuntimeError):
-    """A camera or stream that can't be opened or delivers nothing more; the message names it."""
+    """A camera or stream can't be opened or delivers no more frames; the message names it."""
 
 
 class Source(Protocol):
-    """Frames of one camera. A `live` one stamps them with CLOCK_MONOTONIC and doesn't wait for its reader."""
+    """Frames of one camera. A `live` source stamps them with CLOCK_MONOTONIC and doesn't wait for its reader."""
 
     name: str
     camera: Camera
@@ -49,16 +49,16 @@ class Source(Protocol):
     def frames(self) -> Generator[RecordedFrame]: ...
 
     def resume(self, frame_id: int, t_source_ns: int) -> None:
-        """Called before `frames` where capture was restarted: the next frame is `frame_id`."""
+        """Sets the next frame to `frame_id`; called before `frames` after a restart of capture."""
 
     def close(self) -> None:
-        """Lets the camera go."""
+        """Releases the camera."""
 
 
 def open_source(configuration: Configuration, must_open: bool = True) -> Source:
-    """The source that the configuration names; without `must_open` a camera may be gone for now.
+    """Opens the configured source; without `must_open` a live camera may be disconnected.
 
-    Raises ConfigurationError or DatasetError where it can't be one, SourceError where a camera does not open.
+    Raises ConfigurationError or DatasetError for an invalid source, SourceError if a camera does not open.
     """
     source = configuration.source
     if not source.uri:
@@ -73,9 +73,9 @@ def open_source(configuration: Configuration, must_open: bool = True) -> Source:
 
 
 def recording_uri(text: str) -> str:
-    """What `evaluate` and `calibrate` take: the URI of a recording, or the path of a KITTI directory.
+    """Returns the URI of a recording, given a URI or the path of a KITTI directory.
 
-    Raises ConfigurationError for a live camera and for a scheme that there is not.
+    Raises ConfigurationError for a live camera and for an unknown scheme.
     """
     if scheme_of(text, all_schemes()) is None and (":" not in text or Path(text).expanduser().exists()):
         return f"{KITTI.name}:{text}"
@@ -91,7 +91,7 @@ def open_recorded(
     stride: int = 1,
     topics: BagTopics = BagTopics(),  # noqa: B008
 ) -> Recording:
-    """The recording of a `recording_uri`, without the car's speed. Raises ConfigurationError or DatasetError."""
+    """Opens a `recording_uri` without the car's speed. Raises ConfigurationError or DatasetError."""
     scheme, address = parsed(uri)
     return open_address(scheme, address, camera, stride, None, topics)
 
@@ -118,10 +118,10 @@ def _open_camera(scheme: Scheme, configuration: Configuration, must_open: bool) 
 
 
 def _check_beside(recording: Recording, source: SourceConfig) -> None:
-    """Raises ConfigurationError or DatasetError where odometry or boxes of a file can't be of this recording."""
+    """Raises ConfigurationError or DatasetError if a file of odometry or boxes does not match the recording."""
     for file in filter(None, (source.odometry, source.detections)):
         if source.loop:
-            raise ConfigurationError(f"{file}: is of one pass through the recording; leave source.loop out (no loop)")
+            raise ConfigurationError(f"{file}: covers one pass through the recording; remove source.loop")
     if source.odometry:
         check_odometry(recording, of_sequence(Path(source.odometry).expanduser(), recording.name), source.stride)
     if source.detections:
@@ -130,7 +130,7 @@ def _check_beside(recording: Recording, source: SourceConfig) -> None:
 
 
 class RecordedSource:
-    """A recording, once or in a loop whose time stamps go on."""
+    """A recording, played once or in a loop with increasing time stamps."""
 
     live = False
 
@@ -144,14 +144,14 @@ class RecordedSource:
         self._resume_ns = 0
 
     def resume(self, frame_id: int, t_source_ns: int) -> None:
-        """A recording goes on at its frame of that number; in a loop its time goes on too."""
+        """Continues at this frame of the recording; in a loop also at this time."""
         self._start, self._resume_ns = frame_id, t_source_ns
 
     def close(self) -> None:
-        """Its files are open only while frames are read."""
+        """Does nothing: the files are open only while frames are read."""
 
     def frames(self) -> Generator[RecordedFrame]:
-        """Every frame in order, with growing time stamps."""
+        """Yields every frame in order, with increasing time stamps."""
         left = self._config.frames
         with contextlib.closing(self._passes()) as passes:
             yield from islice(passes, left if left is None else max(0, left - self._start))
@@ -172,7 +172,7 @@ class RecordedSource:
                 yield replace(frame, t_source_ns=frame.t_source_ns + shift_ns, speeds=speeds)
             if not self._config.loop or first_ns is None or last_ns is None or shift_ns is None:
                 return
-            if start:  # the next pass begins at frame 0, whose time lies before this pass's first
+            if start:  # the next pass starts at frame 0, which is earlier than this pass's first frame
                 first_ns, start = next(iter(self.recording.frames())).t_source_ns, 0
             shift_ns += last_ns - first_ns + round(1e9 / self.rate_hz)
 
@@ -180,7 +180,7 @@ class RecordedSource:
 def to_frame(
     undistort: Undistorter, frame_id: int, recorded: RecordedFrame, t_capture_ns: int, t_utc_ns: int = 0
 ) -> Frame:
-    """The one way from a source to the front end, live and in `evaluate`: an undistorted frame, or its status."""
+    """Undistorts a frame; an unreadable one gets a status instead of an image. Used live and offline."""
     image, error = undistorted(undistort, recorded)
     if image is None:
         log.warning("frame %d is unreadable: %s", frame_id, error)
@@ -189,14 +189,14 @@ def to_frame(
 
 
 def offline_frames(source: Source) -> Iterator[Frame]:
-    """All frames of a recording for one process; the capture time is the source's."""
+    """Yields all frames of a recording for one process; the capture time is the source time."""
     undistort = Undistorter(source.camera)
     for frame_id, recorded in enumerate(source.frames()):
         yield to_frame(undistort, frame_id, recorded, recorded.t_source_ns)
 
 
 class Pacer:
-    """When each frame of a recording is due on CLOCK_MONOTONIC: deadlines from the first one on, so nothing drifts."""
+    """Due times of a recording's frames on CLOCK_MONOTONIC, relative to the first frame, so that they do not drift."""
 
     def __init__(self, rate: float | str | None) -> None:
         self._rate = rate
@@ -204,7 +204,7 @@ class Pacer:
         self._first_source_ns = 0
 
     def due_ns(self, frame_id: int, t_source_ns: int, now_ns: int) -> int:
-        """The deadline of a frame; the first one asked for is due now."""
+        """Returns the due time of a frame; the first one is due now."""
         if self._rate == "max":
             return now_ns
         if self._start_ns is None:
@@ -215,10 +215,10 @@ class Pacer:
 
 
 class ReadAhead:
-    """Reads a source in a thread of its own, so that neither decoding nor a slow reader holds up the other.
+    """Reads a source in a thread, with a queue of `capacity` frames.
 
-    `capacity` frames wait. Of a live source the oldest gives way to a new one and is counted in `dropped`; a recording
-    waits instead. Numbers the frames from `first_frame` on, the dropped ones too.
+    A full queue drops the oldest frame of a live source, counted in `dropped`; a recording waits instead. Frames are
+    numbered from `first_frame` on, including the dropped ones.
     """
 
     def __init__(self, source: Source, capacity: int, first_frame: int = 0) -> None:
@@ -257,9 +257,9 @@ class ReadAhead:
                 self._changed.notify_all()
 
     def next(self, timeout_s: float) -> tuple[int, RecordedFrame] | None:
-        """The next frame and its number; None where none came in time.
+        """Returns the next frame and its number; None if none arrived in time.
 
-        Raises EndOfSource when there is no further one, and whatever the source raised.
+        Raises EndOfSource at the end, and any exception of the source.
         """
         with self._changed:
             self._changed.wait_for(lambda: bool(self._waiting) or self._ended, timeout_s)
@@ -274,7 +274,7 @@ class ReadAhead:
         raise EndOfSource
 
     def close(self, timeout_s: float = 1.0) -> None:
-        """Ends the thread; one that is stuck in a camera's driver is left to the end of the process."""
+        """Ends the thread; one that is blocked in a camera driver ends with the process."""
         with self._changed:
             self._closed = True
             self._waiting.clear()

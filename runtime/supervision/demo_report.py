@@ -1,6 +1,6 @@
-"""The errors of a run over the shipped drive, whose truth is known.
+"""The errors of a run over the shipped drive, which has ground truth.
 
-Estimates and map updates are retained during the drive, half a minute of it, and compared after the run.
+Estimates and map updates are kept in memory during the drive and compared after the run.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from birdslam.types import Estimate, MapUpdate
 
 
 class DemoReport:
-    """Takes the published estimates, as birdslam.outputs.drive_files.Recorder does."""
+    """Collects the published estimates and map updates."""
 
     def __init__(self, recording: DemoRecording) -> None:
         self._recording = recording
@@ -28,7 +28,7 @@ class DemoReport:
 
     @classmethod
     def of(cls, configuration: Configuration) -> DemoReport | None:
-        """None where the drive has no truth of vehicles, or no end."""
+        """Returns None if the drive has no ground truth of vehicles, or no end."""
         source = configuration.source
         if scheme_of(source.uri, [DEMO]) is None or source.loop:
             return None
@@ -37,20 +37,20 @@ class DemoReport:
         return cls(recording)
 
     def add(self, estimate: Estimate) -> None:
-        """One frame's."""
+        """Adds the estimate of a frame."""
         self.records.append(estimate)
 
     def add_map(self, update: MapUpdate) -> None:
-        """What the map gained with a frame."""
+        """Adds the map update of a frame."""
         self.records.append(update)
 
     def grade(self) -> DemoGrade | None:
-        """The run against the truth; None where nothing was estimated."""
+        """Returns the errors of the run; None without an estimate."""
         estimates = [record for record in self.records if isinstance(record, Estimate)]
         return grade(self._recording, estimates) if estimates else None
 
     def true_outlines(self, frame_id: int) -> list[Floats]:
-        """Footprints (4, 2) in ego of the vehicles of which something is to be seen in a frame."""
+        """Returns the footprints (4, 2) in ego of the vehicles that are visible in a frame."""
         return [
             outline(body.T_ego_body, body.length_m, body.width_m)
             for body in self._recording.truth_bodies(frame_id)
@@ -59,7 +59,7 @@ class DemoReport:
 
 
 def rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
-    """The lines of the table of a run that speak of the truth; none where none is known."""
+    """Returns the rows of the summary table about the ground truth; none if there is none."""
     if "truth" not in summary:
         return []
     found = msgspec.convert(summary["truth"], DemoGrade)
@@ -81,13 +81,13 @@ def rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
         (
             "  from the ego",
             f"{number(found.vehicle_centre_m, '.2f')} m, {number(found.vehicle_centre_rel, '.1%')} of the range, "
-            f"median; {number(found.reported, '.0%')} of those in clear sight reported, "
-            f"{number(found.found, '.0%')} seen in that very frame",
+            f"median; {number(found.reported, '.0%')} of the clearly visible ones reported, "
+            f"{number(found.found, '.0%')} detected in that frame",
         ),
         (
             "movers",
-            f"{found.false_movers} of {found.standing} tracks of standing vehicles reported to drive; of "
-            f"{found.driving} of driving ones {found.driving - found.missed_movers}, "
+            f"{found.false_movers} of {found.standing} tracks of stationary vehicles reported as moving; of "
+            f"{found.driving} of moving ones {found.driving - found.missed_movers}, "
             f"{found.movers_soon} of them within 1 s",
         ),
     ]

@@ -1,4 +1,4 @@
-"""The report of a drive as one HTML file, of a directory of results or of a recording."""
+"""Writes the report of a drive as one HTML file, from a directory of results or from a recording."""
 
 from __future__ import annotations
 
@@ -21,15 +21,14 @@ def can_report() -> bool:
 
 
 def write_report(source: Path, path: Path, video: Path | None = None) -> int:
-    """Writes the report of a directory of `birdslam run`, or of a recording (.mcap); gives its size in bytes.
+    """Writes the report of a directory of `birdslam run` or of a recording (.mcap); returns its size in bytes.
 
-    `video` is that of `--video`; otherwise it is looked for where summary.json of a directory says. Raises
-    ResultsError, RecordingError.
+    `video` defaults to the one in the directory's summary.json. Raises ResultsError, RecordingError.
     """
     recorded = source.suffix == ".mcap"
     with tempfile.TemporaryDirectory() if recorded else nullcontext(str(source)) as directory:
         if recorded:
-            directory = str(Path(directory) / source.stem)  # the name that the report bears
+            directory = str(Path(directory) / source.stem)  # the title of the report
             _write_results(source, Path(directory))
         drive = read_drive(Path(directory))
         stated = drive.summary.get("video")

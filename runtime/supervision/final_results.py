@@ -1,9 +1,8 @@
-"""Results that are made after a run: the final trajectories, and the video.
+"""Results written after a run: the final trajectories and the video.
 
-Both are made of what the recorder wrote, so that they cost the vehicle no time and no memory: of the file of --record,
-else of a temporary one in the output directory, which is removed when the results are there (a supervisor that is
-killed before leaves its folder .recording-* behind). A video shows the source's own frames; those of a live camera are
-recorded as JPEG. The shipped drive is short: its estimates are kept in memory, and its truth is drawn too.
+Both come from the recording: the file of --record, else a temporary one in the output directory (.recording-*, left
+behind if the supervisor is killed). A video shows the source's frames; those of a live camera are recorded as JPEG.
+For the shipped drive the estimates are kept in memory, and its ground truth is drawn too.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ from birdslam.runtime.supervision.demo_report import DemoReport
 from birdslam.sources.recording import DatasetError
 from birdslam.types import Estimate, MapUpdate, Measurements
 
-DEMO_VIDEO = "drive.mp4"  # of the shipped drive, asked for or not
+DEMO_VIDEO = "drive.mp4"  # of the shipped drive, always written
 TEMPORARY = "drive.mcap"
 
 Frames = Iterator[tuple[int, int, Image | None]]  # frame_id, source time in ns, undistorted image
@@ -42,23 +41,23 @@ Records = Iterable[Measurements | Estimate | MapUpdate]
 
 
 def check_results(configuration: Configuration, source: Source) -> None:
-    """Raises ConfigurationError or ResultsError where what is asked for can't be made."""
+    """Raises ConfigurationError or ResultsError if a requested result can't be written."""
     results, recording = configuration.results, configuration.recording
     check_map_choice(configuration, source.camera)
     if not results.video:
         return
     output = Path(configuration.output)
     if Path(results.video).parent.resolve() == output.resolve():
-        claim_directory(output)  # as the run will
+        claim_directory(output)
     check_video(Path(results.video), source.camera, source.rate_hz)
     if configuration.live and recording.file and not recording.images:
         raise ConfigurationError(
-            "results.video: the frames of a live camera are gone when the drive is over: record them (--record-images)"
+            "results.video: the frames of a live camera are not kept; record them with --record-images"
         )
 
 
 class FinalResults:
-    """Of one run."""
+    """The final results of one run."""
 
     def __init__(self, configuration: Configuration, demo: DemoReport | None) -> None:
         self._config, self._demo = configuration, demo
@@ -71,7 +70,7 @@ class FinalResults:
             self._video = Path(configuration.output) / DEMO_VIDEO
 
     def recorded(self, stack: ExitStack) -> Configuration:
-        """The configuration of the run, with a temporary recording where one is needed and none was asked for."""
+        """Returns the configuration, with a temporary recording if one is needed and none is configured."""
         config = self._config
         needed = config.results.smooth or (self._video is not None and self._demo is None)
         if not needed or config.recording.file:
@@ -82,7 +81,7 @@ class FinalResults:
         return msgspec.structs.replace(config, recording=recording)
 
     def write(self, files: Sequence[Path]) -> dict[str, Any]:
-        """Writes what was asked for, from the recording in `files`; what summary.json says of it.
+        """Writes the requested results from the recording in `files`; returns their entries of summary.json.
 
         Raises ResultsError, DatasetError, RecordingError or OSError.
         """
@@ -97,7 +96,7 @@ class FinalResults:
                 if self._asked_video:
                     raise
                 summary["video"] = None
-        if self.map is not None and self._config.live:  # its frames are gone, and it may be gone itself
+        if self.map is not None and self._config.live:  # no frames to read again
             assert self._config.camera is not None
             summary |= self.map.finish(self._config.camera, iter(()), Path(self._config.output))
         elif self.map is not None:
@@ -117,9 +116,9 @@ class FinalResults:
 
 
 def smooth(files: Sequence[Path], output: Path) -> int:
-    """Writes the final trajectories beside the live ones in `output`; gives the number of vehicles.
+    """Writes the final trajectories beside the live ones in `output`; returns the number of vehicles.
 
-    Read twice, so that no more than the vehicles that are in sight at once is kept in memory, however long the drive.
+    Reads the recording twice, so that only the vehicles in sight are in memory.
     """
     size = sum(path.stat().st_size for path in files)
     with Progress("smoothing", 2 * size, "MB", 1e6) as progress:
@@ -146,7 +145,7 @@ def draw_video(
     last_frame: int | None,
     truth: Callable[[int], Sequence[Floats]] | None = None,
 ) -> None:
-    """Draws a whole drive. Raises ResultsError where the file can't be written."""
+    """Draws a whole drive. Raises ResultsError if the file can't be written."""
     with Progress("video", last_frame) as progress, DriveVideo(path, camera, rate_hz, frames, truth) as video:
         for record in records:
             if isinstance(record, Estimate):
@@ -158,7 +157,7 @@ def draw_video(
 
 
 def source_frames(source: Source) -> Frames:
-    """The frames of a recording, numbered as capture does."""
+    """Yields the frames of a recording, numbered as in capture."""
     undistort = Undistorter(source.camera)
     for frame_id, recorded in enumerate(source.frames()):
         image = recorded.image
@@ -167,9 +166,9 @@ def source_frames(source: Source) -> Frames:
 
 
 def recorded_frames(files: Sequence[Path]) -> tuple[Camera, float, Frames]:
-    """The camera, its rate and the frames of a recording with images, by their numbers in the run.
+    """Returns the camera, its rate and the frames of a recording with images, numbered as in the run.
 
-    Raises DatasetError where the first file has none.
+    Raises DatasetError if the first file has no images.
     """
     first = RecordedImages(files[0])
 
@@ -177,7 +176,7 @@ def recorded_frames(files: Sequence[Path]) -> tuple[Camera, float, Frames]:
         for path in files:
             try:
                 images = RecordedImages(path)
-            except DatasetError:  # of a recorder that was restarted and ended before its second frame
+            except DatasetError:  # a restarted recorder that wrote less than two frames
                 continue
             for frame in images.frames():
                 yield images.first_frame + frame.index, frame.t_source_ns, frame.image
@@ -186,14 +185,14 @@ def recorded_frames(files: Sequence[Path]) -> tuple[Camera, float, Frames]:
 
 
 def _last_frame(files: Sequence[Path], demo: DemoReport | None) -> int | None:
-    """The frame of the last estimate, for the time to go."""
+    """Returns the frame of the last estimate, for the progress."""
     if demo is not None:
         return max((r.frame_id for r in demo.records if isinstance(r, Estimate)), default=None)
     return max((m.frame_id for m in measurements_of(map(Recording, files))), default=None)
 
 
 def rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
-    """The lines of the table of a run that speak of the final results."""
+    """Returns the rows of the summary table about the final results."""
     out = []
     if "final_tracks" in summary:
         out.append(

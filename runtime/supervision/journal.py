@@ -1,4 +1,4 @@
-"""systemd's journal by its native protocol: lines with a priority and fields, to be searched by.
+"""Writes to systemd's journal by its native protocol: entries with a priority and fields.
 
 journalctl -u birdslam BIRDSLAM_NODE=perceive PRIORITY=4 -o json
 """
@@ -15,7 +15,7 @@ SOCKET = "/run/systemd/journal/socket"
 
 
 class Priority(IntEnum):
-    """syslog(3)'s."""
+    """The priorities of syslog(3)."""
 
     ERROR = 3
     WARNING = 4
@@ -24,20 +24,20 @@ class Priority(IntEnum):
 
 
 class Journal:
-    """A way into the journal. What can't be delivered is lost: a log never stops a drive."""
+    """A connection to the journal. Undeliverable entries are lost, so that logging never stops a drive."""
 
     def __init__(self, address: str = SOCKET) -> None:
         self._address = address
 
     def send(self, message: str, priority: Priority, **fields: str) -> None:
-        """One entry; the names of `fields` in capitals."""
+        """Sends one entry; names of `fields` are in capitals."""
         entry = {"MESSAGE": message, "PRIORITY": str(int(priority)), "SYSLOG_IDENTIFIER": "birdslam", **fields}
         data = b"".join(_field(name, value.encode(errors="replace")) for name, value in entry.items())
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as out:
             out.setblocking(False)
             try:
                 out.sendto(data, self._address)
-            except OSError:  # no journal now, a full one, or an entry that is too large for it
+            except OSError:  # no journal, a full journal, or an entry that is too large
                 return
 
 
@@ -47,8 +47,8 @@ def _field(name: str, value: bytes) -> bytes:
     return name.encode() + b"=" + value + b"\n"
 
 
-def journal_behind(stream: TextIO, environment: Mapping[str, str] = os.environ) -> Journal | None:
-    """The journal, where it is what `stream` is written to (systemd.exec(5), JOURNAL_STREAM); else None."""
+def journal_of(stream: TextIO, environment: Mapping[str, str] = os.environ) -> Journal | None:
+    """Returns the journal if `stream` is connected to it (systemd.exec(5), JOURNAL_STREAM); else None."""
     device, _, inode = environment.get("JOURNAL_STREAM", "").partition(":")
     try:
         state = os.fstat(stream.fileno())

@@ -6,31 +6,30 @@ import shutil
 import time
 from typing import TextIO
 
-from birdslam.runtime.supervision.journal import Priority, journal_behind
+from birdslam.runtime.supervision.journal import Priority, journal_of
 from birdslam.runtime.topology import NODES
 
-JOURNAL_PERIOD_S = 60.0  # of the status in the journal; `systemctl status` has the newest
+JOURNAL_PERIOD_S = 60.0  # of the status in the journal; `systemctl status` shows the newest
 
 
 class LiveLine:
-    """A status line that lines of text may interrupt. Where `stream` is no terminal, the status is a line a second.
+    """A status line with messages above it. If `stream` is no terminal, the status is one line per second.
 
-    In the journal it is an entry a minute, and a warning of a node has the field BIRDSLAM_NODE.
-    A line that can't be written (a full disk) is counted in `lost`, and the vehicle drives on; a closed pipe is
-    BrokenPipeError.
+    In the journal the status is one entry per minute, and a warning of a node has the field BIRDSLAM_NODE. A line that
+    can't be written (a full disk) is counted in `lost`; a closed pipe raises BrokenPipeError.
     """
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
         self.terminal = stream.isatty()
-        self._journal = journal_behind(stream)
+        self._journal = journal_of(stream)
         self.period_s = 0.2 if self.terminal else JOURNAL_PERIOD_S if self._journal else 1.0
         self.lost = 0
         self._visible = False
         self._due_s = 0.0
 
     def update(self, status: str) -> None:
-        """Shows the status, if it is time for it."""
+        """Shows the status if it is due."""
         now_s = time.monotonic()
         if now_s < self._due_s:
             return
@@ -45,7 +44,7 @@ class LiveLine:
             self._write(f"{status}\n")
 
     def say(self, text: str) -> None:
-        """A line that stays."""
+        """Prints a message above the status line."""
         self.clear()
         if self._journal:
             about = text.partition(" ")[0].rstrip(":")
@@ -57,7 +56,7 @@ class LiveLine:
         self._write(f"{text}\n")
 
     def clear(self) -> None:
-        """Takes the status away."""
+        """Removes the status line."""
         if self._visible:
             self._write("\r\x1b[K")
             self._visible = False

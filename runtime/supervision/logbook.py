@@ -1,4 +1,4 @@
-"""The supervisor's subscriber: it hands every estimate and map update to the results, and counts."""
+"""The supervisor's subscriber: passes every estimate and map update to the results, and counts them."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from birdslam.runtime.progress import time_to_go
 from birdslam.runtime.transport.bus import Bus, BusClosed, Message
 from birdslam.types import Estimate, MapUpdate, Status
 
-QUEUE_FRAMES = 1024  # a disk that stalls for half a minute costs no row
-MAP_WAIT_S = 2.0  # for the last of the map, which optimize sends before the end
+QUEUE_FRAMES = 1024  # no loss if the disk stalls for half a minute
+MAP_WAIT_S = 2.0  # for the last map update, which optimize sends before the end
 RECENT_FRAMES = 32
 
 
@@ -23,18 +23,17 @@ _Record = TypeVar("_Record", Estimate, MapUpdate)
 
 
 class Results(Protocol):
-    """What receives the results of a drive while it goes on, as `birdslam.outputs.drive_files.Recorder` does."""
+    """Receives the results of a drive while it runs, as `birdslam.outputs.drive_files.Recorder` does."""
 
     def add(self, estimate: Estimate) -> None: ...
     def add_map(self, update: MapUpdate) -> None: ...
 
 
 class Logbook:
-    """Subscribes in a thread of its own from construction on; it is a planner like others, so its ages are a planner's.
+    """Subscribes in a thread, as a planner does, so that its ages are a planner's.
 
-    `event_fd` becomes readable when END_OF_SOURCE came back (`ended`), or recording failed (`error`). A `tolerant` one
-    goes on without recording where the disk fails it (`unwritten` says why): the vehicle drives on. `listeners` too
-    get all of it.
+    `event_fd` becomes readable after END_OF_SOURCE (`ended`) or a failure to write (`error`). If `tolerant`, a disk
+    failure only ends the writing (reason in `unwritten`). `listeners` receive the same records as `results`.
     """
 
     def __init__(self, bus: Bus, results: Results, tolerant: bool = False, listeners: Sequence[Results] = ()) -> None:
@@ -47,7 +46,7 @@ class Logbook:
         self.age = Distribution()
         self.stages: dict[str, Distribution] = {}
         self.statuses: Counter[str] = Counter()
-        self.predicted = 0  # frames that perceive answered without looking at them
+        self.predicted = 0  # frames that perceive predicted
         self.speed_sources: Counter[str] = Counter()
         self._results = results
         self._listeners = tuple(listeners)
@@ -69,7 +68,7 @@ class Logbook:
                     self._take(message)
         except BusClosed:
             return
-        except Exception as error:  # a full disk: the supervisor's to report
+        except Exception as error:  # reported by the supervisor
             self.error = error
         finally:
             os.eventfd_write(self.event_fd, 1)
@@ -83,7 +82,7 @@ class Logbook:
         self.statuses.update(status.value for status in estimate.status)
         self.speed_sources.update(source.value for source in estimate.speed_sources)
         self._latest = estimate
-        if Status.PERCEPTION_LATE in estimate.status:  # nothing was measured: no row, and no frame that was processed
+        if Status.PERCEPTION_LATE in estimate.status:  # without measurements: not counted as processed
             return
         self.predicted += Status.COASTING in estimate.status
         for listener in self._listeners:
@@ -110,7 +109,7 @@ class Logbook:
             self.unwritten = error
 
     def _take_map(self, until_frame: int | None = None) -> None:
-        """What has arrived of the map; with `until_frame`, all up to the update of that frame."""
+        """Takes the map updates that have arrived; with `until_frame`, waits for the update of that frame."""
         until_s = time.monotonic() + (MAP_WAIT_S if until_frame is not None else 0.0)
         while self._map_frame != until_frame:
             message = self._map.recv(max(0.0, until_s - time.monotonic()))
@@ -123,12 +122,12 @@ class Logbook:
 
     @property
     def rate_hz(self) -> float:
-        """Over the whole run."""
+        """The mean rate of the run."""
         span_ns = self._last_ns - self._first_ns
         return (self.recorded - 1) * 1e9 / span_ns if span_ns > 0 else 0.0
 
     def status_line(self, frames: int | None = None) -> str:
-        """What goes on now: rate, age, tracks and warnings of the newest frames. `frames`: how many there will be."""
+        """Returns rate, age, tracks and statuses of the newest frames. `frames`: the number of frames of the source."""
         recent, latest = tuple(self._recent), self._latest
         if latest is None or not recent:
             return "waiting for the first frame"
@@ -146,7 +145,7 @@ class Logbook:
         ).rstrip()
 
     def figures(self) -> dict[str, Any]:
-        """For summary.json."""
+        """Returns the entries of summary.json."""
         return {
             "rate_hz": round(self.rate_hz, 3),
             "age_ms": self.age.summary(),
@@ -156,11 +155,11 @@ class Logbook:
         }
 
     def wait_over(self, timeout_s: float) -> None:
-        """Until the end was taken in, or recording failed."""
+        """Waits until the end was received, or recording failed."""
         self._thread.join(timeout_s)
 
     def close(self) -> None:
-        """Leaves the bus, which ends the thread."""
+        """Closes the bus, which ends the thread."""
         self._bus.close()
         self._thread.join()
         os.close(self.event_fd)

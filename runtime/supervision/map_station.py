@@ -1,4 +1,4 @@
-"""The map process of a run: its station, and what it leaves for the summary."""
+"""The map process of a run: its station and its entries of the summary."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from birdslam.runtime.process.beside import DISK_STATUS
 from birdslam.runtime.supervision.stations import Duty, Station
 from birdslam.runtime.topology import MAP
 
-WATCHDOG_S = 30.0  # a loop of a long map takes seconds to close
+WATCHDOG_S = 30.0  # closing a loop in a long map takes seconds
 
 
 def map_station(configuration: Configuration, logs: Path) -> Station:
-    """At work. Nothing waits for it while the vehicle drives, and the run goes on without it."""
+    """Starts the map process. The run continues without it."""
     (logs / SUMMARY).unlink(missing_ok=True)
     duty = Duty(
         module="birdslam.runtime.maps.map_process",
@@ -30,10 +30,10 @@ def map_station(configuration: Configuration, logs: Path) -> Station:
 
 
 def map_summary(station: Station, logs: Path) -> dict[str, Any]:
-    """ "map" and "earth" of summary.json, once it has ended."""
+    """Returns "map" and "earth" of summary.json after the process has ended."""
     try:
         found: dict[str, Any] = msgspec.json.decode((logs / SUMMARY).read_bytes(), type=dict[str, Any])
     except (OSError, msgspec.DecodeError):
-        found = {"map": {"error": f"the map process {station.process.how()}; what it had saved before is there"}}
+        found = {"map": {"error": f"the map process {station.process.how()}; its last saved map is kept"}}
     found["map"]["restarts"] = station.restarts.count
     return found

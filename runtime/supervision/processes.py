@@ -1,4 +1,4 @@
-"""A node's process: started, watched by a pidfd, with its log and the reason why it ended."""
+"""The process of a node: start, pidfd, log, and the reason for its end."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _REPORTED_LEVELS = (" WARNING ", " ERROR ", " CRITICAL ")
 
 
 class NodeLog:
-    """`logs/<node>.log`: what all processes of a node print, one after the other."""
+    """`logs/<node>.log`: the output of all processes of a node."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -27,7 +27,7 @@ class NodeLog:
         path.write_bytes(b"")
 
     def new_warnings(self) -> list[str]:
-        """Lines that were logged as warnings or worse since the last call."""
+        """Returns the lines logged as warnings or worse since the last call."""
         with self.path.open("rb") as log:
             log.seek(self._read)
             whole, newline, _ = log.read().rpartition(b"\n")
@@ -36,18 +36,18 @@ class NodeLog:
         return [_message(line) for line in lines if any(level in line for level in _REPORTED_LEVELS)]
 
     def size(self) -> int:
-        """In bytes, now."""
+        """Returns the size in bytes."""
         return self.path.stat().st_size
 
     def lines(self, start: int) -> list[str]:
-        """The lines from byte `start` on, without empty ones."""
+        """Returns the non-empty lines from byte `start` on."""
         with self.path.open("rb") as log:
             log.seek(start)
             return [line for line in log.read().decode(errors="replace").splitlines() if line.strip()]
 
 
 class NodeProcess:
-    """One process of a node: it loads what it needs at once, and waits for `begin`."""
+    """One process of a node: loads its dependencies at once, then waits for `begin`."""
 
     def __init__(
         self, name: str, configuration: Configuration, log: NodeLog, module: str = "birdslam.runtime.nodes.runner"
@@ -70,7 +70,7 @@ class NodeProcess:
         self._send(configuration)
 
     def begin(self, assignment: msgspec.Struct) -> None:
-        """Its work begins; nothing more is sent to it."""
+        """Sends the assignment, which starts its work."""
         self.begun_s = time.monotonic()
         self._send(assignment)
         assert self._process.stdin is not None
@@ -93,32 +93,32 @@ class NodeProcess:
 
     @property
     def exit_status(self) -> int | None:
-        """As of Popen.returncode: negative for a signal; None while it runs."""
+        """Like Popen.returncode: negative for a signal; None while it runs."""
         return self._process.poll()
 
     @property
     def ready(self) -> bool:
-        """It is at work."""
+        """Whether it has started its work."""
         return bool(self.vitals["ready"])
 
     def silent_s(self) -> float:
-        """How long its loop has not beaten; 0 before it is ready."""
+        """Returns the time since the last heartbeat in s; 0 before it is ready."""
         return (time.monotonic_ns() - self.vitals["beat_ns"]) / 1e9 if self.ready else 0.0
 
     def send(self, number: signal.Signals) -> None:
-        """A signal, where it still runs."""
+        """Sends a signal if it still runs."""
         if self.exit_status is None:
             self._process.send_signal(number)
 
     def how(self) -> str:
-        """How it ended."""
+        """Returns how it ended."""
         status = self.exit_status
         if status is not None and status < 0:
             return f"was killed by {signal.Signals(-status).name}"
         return f"failed with exit status {status}" if status else "ended before its source did"
 
     def failure(self, cause: str = "", then: str = "") -> str:
-        """Why it ended, for a person, and what comes of it; with the last line of its log. `cause` goes before `how`"""
+        """Returns a message: why it ended (`cause`, else `how`), the consequence `then`, the last line of its log."""
         lines = self._log.lines(self._log_start)
         if self.exit_status == USER_ERROR_STATUS and not then:
             errors = [line for line in lines if " ERROR " in line]
@@ -127,7 +127,7 @@ class NodeProcess:
         return f"{self.name} {cause or self.how()}{then}{last} (log: {self._log.path})"
 
     def close(self) -> None:
-        """Kills what still runs, and lets go of it."""
+        """Kills the process if it still runs, and releases its resources."""
         self.send(signal.SIGKILL)
         self._process.wait()
         if self.begun_s is None and self._process.stdin is not None:
@@ -137,21 +137,21 @@ class NodeProcess:
 
 
 def waited_s(pid: int) -> dict[int, float]:
-    """For which each thread of a process has been ready to run and waited for a core; empty where Linux does not say.
+    """Returns the time that each thread of a process has waited for a core; empty if Linux does not report it.
 
-    All of them: a thread that waits for a core may hold the interpreter's lock, and the main thread then waits for it.
+    All threads count, since any of them may hold the interpreter's lock while it waits.
     """
     found = {}
     for path in Path(f"/proc/{pid}/task").glob("*/schedstat"):
         try:
             found[int(path.parent.name)] = int(path.read_text().split()[1]) / 1e9
-        except (OSError, IndexError):  # it has just ended
+        except (OSError, IndexError):  # the thread has just ended
             continue
     return found
 
 
 def _message(line: str) -> str:
-    """A log line without its date and level."""
+    """Returns a log line without its date and level."""
     for level in _REPORTED_LEVELS:
         if level in line:
             return line.partition(level)[2]

@@ -1,6 +1,6 @@
-"""The supervisor answers planners' queries: the whole map, every trajectory so far, the configuration.
+"""Answers planners' queries in the supervisor: the whole map, all trajectories so far, the configuration.
 
-It lives through restarts of the nodes. Replies go in parts that each fit a message.
+It survives restarts of the nodes. A reply is split into parts that each fit into a message.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from birdslam.types import Estimate, MapUpdate
 
 
 class QueryServer:
-    """Keeps what comes out of the optimizer, and answers queries about all of it; until its bus is closed."""
+    """Stores the output of the optimizer and answers queries about it until its bus is closed."""
 
     def __init__(self, configuration: Configuration, bus: Bus) -> None:
         self._configuration = configuration
@@ -30,13 +30,13 @@ class QueryServer:
         )
 
     def add(self, estimate: Estimate) -> None:
-        """One frame's."""
+        """Adds the estimate of a frame."""
         with self._turn:
             self._atlas.add(estimate)
             self._newest = estimate
 
     def add_map(self, update: MapUpdate) -> None:
-        """What the map gained with a frame whose estimate was added before."""
+        """Adds the map update of a frame, after its estimate."""
         with self._turn:
             if self._newest is not None:
                 self._atlas.add(self._newest, update)
@@ -60,9 +60,9 @@ class QueryServer:
         with self._turn:
             newest = self._newest
         if newest is None:
-            raise QueryRefused("nobody is near yet: nothing has been estimated")
+            raise QueryRefused("there are no road users yet: nothing has been estimated")
         return (nearby(newest),)
 
     def _settings(self, parameters: Mapping[str, str]) -> Sequence[Configuration]:
-        """With nothing that lets anybody in: a camera's address may bear a password."""
+        """Without the passwords in camera addresses."""
         return (without_passwords(self._configuration),)

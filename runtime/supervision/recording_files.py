@@ -1,7 +1,7 @@
-"""The files of a recorded run, their status and their figures.
+"""The files of a recorded run and their statistics.
 
-A recorder that died or stalled is restarted in a file of its own beside the first: `drive.mcap`, `drive-2.mcap`, ...
-A disk that fails ends the recording, and the drive goes on.
+A restarted recorder writes a new file beside the first: `drive.mcap`, `drive-2.mcap`, ... A disk failure ends the
+recording, but not the drive.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ SUFFIX = ".mcap"
 
 
 def choose_file(config: RecordingConfig, vehicle: str) -> str:
-    """The file to be written; in a directory, a new one that is named by vehicle and time.
+    """Returns the file to write; in a directory a new one, named by vehicle and time.
 
-    Raises ConfigurationError where there can't be one.
+    Raises ConfigurationError if the file can't be created.
     """
     path = Path(config.file)
     if path.is_dir():
@@ -34,12 +34,12 @@ def choose_file(config: RecordingConfig, vehicle: str) -> str:
     if path.exists():
         raise ConfigurationError(f"recording.file: {path}: exists; recordings are never overwritten")
     if not path.parent.is_dir():
-        raise ConfigurationError(f"recording.file: {path}: there is no directory {path.parent}")
+        raise ConfigurationError(f"recording.file: {path}: no such directory: {path.parent}")
     return str(path)
 
 
 class RecordingFiles:
-    """The files of one run, one for each of the recorder's processes."""
+    """The files of one run, one per recorder process."""
 
     def __init__(self, first: Path, models: dict[str, Any]) -> None:
         self._first, self._models = first, models
@@ -47,12 +47,12 @@ class RecordingFiles:
         self._bytes: dict[Path, int] = {}
 
     def station(self, configuration: Configuration, logs: Path) -> Station:
-        """The recorder at work. Nothing waits for it while the vehicle drives, and the run goes on without it."""
+        """Starts the recorder. The run continues without it."""
         duty = Duty(
             module="birdslam.runtime.nodes.recorder",
             first_message=self._assignment,
             final_statuses=(USER_ERROR_STATUS, DISK_STATUS),
-            without="nothing is recorded any more",
+            without="the recording has ended",
         )
         return Station(RECORDER.name, configuration, logs, duty)
 
@@ -67,14 +67,14 @@ class RecordingFiles:
         return path
 
     def status(self, recorder: Station) -> str:
-        """For the live line."""
+        """Returns the text for the status line."""
         if not recorder.working and not recorder.process.vitals["ended"]:
             return "NOT RECORDED"
         lost = recorder.total("dropped") + recorder.total("torn")
         return f"recorded {self._size() / 1e6:.1f} MB" + (f" ({lost} lost)" if lost else "")
 
     def _size(self) -> int:
-        """Of all files; of one that was not made yet, or taken away, the last that is known."""
+        """Returns the size of all files; of a missing file its last known size."""
         for path in self.paths:
             try:
                 self._bytes[path] = path.stat().st_size
@@ -83,7 +83,7 @@ class RecordingFiles:
         return sum(self._bytes.values())
 
     def figures(self, recorder: Station) -> dict[str, Any]:
-        """For summary.json, when the recorder has ended."""
+        """Returns the entries of summary.json after the recorder has ended."""
         return {
             "file": str(self.paths[0]),
             "files": [str(path) for path in self.paths],

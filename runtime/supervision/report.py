@@ -1,4 +1,4 @@
-"""The report of a run at its end: summary.json, and a table for a person."""
+"""The report at the end of a run: summary.json and the printed table."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from birdslam.runtime.topology import NODES
 def summarise(
     configuration: Configuration, stations: Mapping[str, Station], logbook: Logbook, models: dict[str, Any], ended: str
 ) -> dict[str, Any]:
-    """What summary.json says of the run, beside the recorder's counts."""
+    """Returns the content of summary.json, without the recorder's counts."""
     sent = {name: stations[name].total("frames") for name in NODES}
     by = {
         "capture": stations["capture"].total("dropped"),
@@ -31,10 +31,10 @@ def summarise(
         "source": configuration.source.uri,
         "frames_in": sent["capture"] + by["capture"],
         "frames_processed": logbook.recorded,
-        "frames_predicted": logbook.predicted,  # of those: perceive had no time to look at them
+        "frames_predicted": logbook.predicted,  # of those, predicted by perceive for lack of time
         "frames_dropped": sum(by.values()),
         "dropped_by": by,
-        "looks": stations["perceive"].total("looks"),  # frames on which networks were begun
+        "looks": stations["perceive"].total("looks"),  # frames on which a network ran
         "torn": stations["perceive"].total("torn"),
         "malformed": sum(station.total("malformed") for station in stations.values()),
         "car_speeds": {
@@ -51,7 +51,7 @@ def summarise(
 
 
 def _budget(configuration: Configuration, logbook: Logbook) -> dict[str, Any]:
-    """Whether the age of the estimates was within the budget end to end."""
+    """Returns the age of the estimates and whether it is within the end-to-end budget."""
     budgets = configuration.budgets
     age_ms = logbook.age.percentile(budgets.percentile)
     return {
@@ -63,7 +63,7 @@ def _budget(configuration: Configuration, logbook: Logbook) -> dict[str, Any]:
 
 
 def table(summary: dict[str, Any], output: Path) -> str:
-    """The figures of a run for a person."""
+    """Returns the figures of a run as a printable table."""
 
     def spread(figures: dict[str, float]) -> str:
         if not figures:
@@ -75,7 +75,7 @@ def table(summary: dict[str, Any], output: Path) -> str:
     dropped = {name: n for name, n in summary["dropped_by"].items() if n}
     by = f" ({', '.join(f'{n} by {name}' for name, n in dropped.items())})" if dropped else ""
     unseen = summary["frames_predicted"]
-    predicted = f" ({unseen} of them predicted, not looked at)" if unseen else ""
+    predicted = f" ({unseen} of them predicted)" if unseen else ""
     paced = (
         ("age at the planner", spread(summary["age_ms"])),
         ("  of its budget", budget),
@@ -89,10 +89,8 @@ def table(summary: dict[str, Any], output: Path) -> str:
             f"{summary['frames_dropped']} dropped{by}",
         ),
         ("rate", f"{summary['rate_hz']:.2f} Hz"),
-        ("networks began on", f"{summary['looks']} frames"),
-        *(
-            paced if summary["configuration"]["source"]["rate"] != "max" else ()
-        ),  # there frames wait, and nobody for them
+        ("networks ran on", f"{summary['looks']} frames"),
+        *(paced if summary["configuration"]["source"]["rate"] != "max" else ()),  # at rate "max" frames wait in queues
         *((f"  {name} restarted", f"{n} times") for name, n in summary["restarts"].items() if n),
         *((f"  {status}", f"{n} frames") for status, n in summary["statuses"].items()),
         *((f"  metres from {source}", f"{n} frames") for source, n in summary["speed_sources"].items()),
@@ -106,7 +104,7 @@ def table(summary: dict[str, Any], output: Path) -> str:
 
 
 def _readings(speeds: dict[str, int]) -> str:
-    return f"{speeds['taken']} taken from the bus, {speeds['dropped']} lost"
+    return f"{speeds['taken']} received from the bus, {speeds['dropped']} lost"
 
 
 def _recorded(recording: dict[str, Any]) -> str:

@@ -1,8 +1,8 @@
-"""A whole run: what is checked before it, the processes, and what is written when it is over.
+"""A whole run: the checks before it, the processes, and the results after it.
 
-Exit status: 0 at the end of the source, and after SIGTERM (a service's ordered stop); 130 after Ctrl-C; in each case
-the frames in flight are processed and the results written. 1 where a node failed for good, 2 where what the user gave
-can't be used; the reason is one line on standard error.
+Exit status: 0 at the end of the source and after SIGTERM, 130 after Ctrl-C; in each case the frames in flight are
+processed and the results written. 1 if a node failed permanently, 2 for invalid input; the reason is one line on
+standard error.
 """
 
 from __future__ import annotations
@@ -46,18 +46,17 @@ from birdslam.runtime.transport.bus import Bus
 from birdslam.runtime.transport.presence import VehicleLock, own_runtime_dir, runtime_dir_of, socket_path
 from birdslam.sources.recording import DatasetError
 
-ANY_VEHICLE = Configuration().vehicle  # of one that is not named
+ANY_VEHICLE = Configuration().vehicle  # the default name
 WITHOUT_MODELS = "no networks: odometry only, without vehicles and lanes"
-USER_MENDS = MapError, GnssError, EarthError, ConfigurationError  # of a map or fixes, when the drive is over
-# Of objects and of tables: what the atlas (two epochs of 13 MiB at the most) and results come to among lane lines
-DRIVE_MIB = 32.0, 8.0
+USER_ERRORS = MapError, GnssError, EarthError, ConfigurationError  # of a map or GNSS fixes, after the drive
+DRIVE_MIB = 32.0, 8.0  # reserved for objects (the atlas has up to two epochs of 13 MiB) and for tables
 
 
 def run(configuration: Configuration, lengths_by: LengthsBy | None = None) -> int:
-    """A whole run; gives the exit status. Raises what a user has to mend before anything is started.
+    """Runs a drive; returns the exit status. Raises errors of the user before anything is started.
 
-    `lengths_by`: what the metres rest on, for the verdict at the end, where a first pass found the camera. A drive of
-    every frame of a recording, by no name and in no place of its own, has a bus for itself alone.
+    `lengths_by`: the source of the metric scale, for the verdict at the end, if a first pass calibrated the camera. At
+    rate "max", without a vehicle name or a runtime directory, the run has a private bus.
     """
     alone = configuration.lossless and configuration.vehicle == ANY_VEHICLE and configuration.runtime_dir is None
     with own_runtime_dir(configuration.vehicle) if alone else nullcontext() as directory:
@@ -68,9 +67,9 @@ def run(configuration: Configuration, lengths_by: LengthsBy | None = None) -> in
 
 
 def _run(configuration: Configuration, lengths_by: LengthsBy | None) -> int:
-    realtime.use_one_heap()  # before networks are looked at, which begins threads
+    realtime.use_one_heap()  # before the networks are loaded, which starts threads
     configuration, models, frames = check(configuration)
-    give_back_memory()  # the networks that were looked at
+    give_back_memory()  # of the networks
     output = Path(configuration.output)
     realtime.reserve(*DRIVE_MIB)
     live = LiveLine(sys.stdout)
@@ -97,7 +96,7 @@ def _run(configuration: Configuration, lengths_by: LengthsBy | None) -> int:
             if configuration.recording.file:
                 summary["recording"] = figures
             elif figures["dropped"]:
-                live.say(f"{figures['dropped']} messages did not come to the recorder: the final results lack them")
+                live.say(f"the recorder lost {figures['dropped']} messages: the final results lack them")
         if supervisor.map is not None:
             summary |= map_summary(supervisor.map, output / "logs")
         if demo is not None and (found := demo.grade()) is not None:
@@ -105,10 +104,10 @@ def _run(configuration: Configuration, lengths_by: LengthsBy | None) -> int:
         try:
             if logbook.recorded:
                 summary |= final.write(files.paths if files is not None else ())
-        except (ResultsError, DatasetError, RecordingError, *USER_MENDS, OSError) as error:
+        except (ResultsError, DatasetError, RecordingError, *USER_ERRORS, OSError) as error:
             supervisor.fail(f"final results can't be written: {error}", 1)
         except KeyboardInterrupt:
-            supervisor.fail("the final results were cut short", INTERRUPTED_STATUS)
+            supervisor.fail("the final results were interrupted", INTERRUPTED_STATUS)
     sentences: list[str] = []
     try:
         sentences = recorder.finish(summary, lengths_by)
@@ -124,7 +123,7 @@ def _run(configuration: Configuration, lengths_by: LengthsBy | None) -> int:
             reported = False
     live.say(table(summary, output))
     if reported:
-        live.say(f"{'to look at':24}{output / REPORT}")
+        live.say(f"{'report':24}{output / REPORT}")
     if sentences:
         live.say("\n".join(("", *sentences)))
     if supervisor.failure:
@@ -135,7 +134,7 @@ def _run(configuration: Configuration, lengths_by: LengthsBy | None) -> int:
 def _logbook(
     configuration: Configuration, recorder: Recorder, listeners: Sequence[Results], stack: ExitStack
 ) -> Logbook:
-    """The supervisor on the bus: it takes the results, and answers queries about them."""
+    """Connects the supervisor to the bus: it receives the results and answers queries about them."""
     bus = stack.enter_context(
         Bus(
             configuration.vehicle,
@@ -153,16 +152,16 @@ def _logbook(
 
 
 def check(configuration: Configuration) -> tuple[Configuration, dict[str, Any], int | None]:
-    """Everything that can be wrong before a process is started; fills in the source's own camera.
+    """Checks the configuration before a process is started, and fills in the source's camera.
 
-    Gives the networks' descriptions too, and how many frames the source has, where it has an end that is known. Raises
-    ConfigurationError, SourceError, datasets.DatasetError, perception.ModelError or results.ResultsError.
+    Returns also the descriptions of the networks, and the number of frames of the source if it is known. Raises
+    ConfigurationError, SourceError, DatasetError, ModelError or ResultsError.
     """
     check_runtime_dir(configuration.vehicle, configuration.runtime_dir)
     source = open_source(configuration)
     configuration = complete(configuration, source.camera, source.rate_hz)
     frames: int | None = None
-    source.close()  # capture opens it for itself
+    source.close()  # capture opens it again
     if isinstance(source, RecordedSource) and not configuration.source.loop:
         frames = min(len(source.recording), configuration.source.frames or len(source.recording)) or None
     check_results(configuration, source)
@@ -174,9 +173,9 @@ def check(configuration: Configuration) -> tuple[Configuration, dict[str, Any], 
 
 
 def _described(configuration: Configuration) -> dict[str, Any]:
-    """What each network is, its provider as it is asked for. Raises ModelError where one can't be used.
+    """Returns the description of each network with its requested provider. Raises ModelError for an unusable one.
 
-    They are loaded in a process that ends: the supervisor would hold for all of the drive what that took, 50 MB.
+    A child process loads them, so that the supervisor does not keep their memory.
     """
     context = multiprocessing.get_context("fork")
     receiver, sender = context.Pipe(duplex=False)
@@ -197,7 +196,7 @@ def _described(configuration: Configuration) -> dict[str, Any]:
 def _describe(configuration: Configuration, sender: Connection) -> None:
     models, asked = configuration.models, configuration.perceive.provider
     try:
-        # Loaded on the CPU here. What computes it in perceive is in its log, and in PROVIDER_MISSING
+        # Loaded on the CPU; the provider in perceive is in its log and in PROVIDER_MISSING
         out = {
             role: load_network(role, msgspec.structs.replace(spec, provider="cpu")).describe()
             | {"provider": spec.provider or asked}
@@ -211,7 +210,7 @@ def _describe(configuration: Configuration, sender: Connection) -> None:
 
 
 def check_runtime_dir(vehicle: str, runtime_dir: Path | None) -> None:
-    """Raises ConfigurationError where sockets can't lie there."""
+    """Raises ConfigurationError if the sockets can't be created there."""
     try:
         for name in (*NODES, "supervisor"):
             socket_path(runtime_dir_of(vehicle, runtime_dir), name)

@@ -1,4 +1,4 @@
-"""One node of a run through all its processes: the one at work, the spare beside it, restarts and watchdog."""
+"""One node of a run with its processes: the active one, the spare, restarts and watchdog."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from birdslam.runtime.transport.presence import remove_socket, runtime_dir_of
 
 _SUMMED = ("frames", "dropped", "malformed", "torn", "coasted", "outrun", "speeds", "speeds_dropped")
 
-MISSED_RECORDS = 10  # in a row that a node was sent and has not taken in: fewer may be on their way
+MAX_MISSED_RECORDS = 10  # consecutive records sent to a node and not received; fewer may be in transit
 
 
 def _assignment_alone(assignment: Assignment) -> msgspec.Struct:
@@ -28,48 +28,43 @@ def _assignment_alone(assignment: Assignment) -> msgspec.Struct:
 
 @dataclass(frozen=True)
 class Duty:
-    """What the processes of a station run, and whether the run can go on without them."""
+    """What the processes of a station run, and whether the run can continue without them."""
 
     module: str = "birdslam.runtime.nodes.runner"
-    first_message: Callable[[Assignment], msgspec.Struct] = _assignment_alone  # sent when its work begins
-    final_statuses: tuple[int, ...] = ()  # exit statuses after which none is restarted; the log says why
-    without: str = ""  # the run goes on without it, and this is said; "": the run fails with it
-    watchdog_s: float | None = None  # where it may show no life for longer than the others
+    first_message: Callable[[Assignment], msgspec.Struct] = _assignment_alone  # sent at the start of its work
+    final_statuses: tuple[int, ...] = ()  # exit statuses without a restart
+    without: str = ""  # message when the run continues without it; "": the run fails with it
+    watchdog_s: float | None = None  # limit of the heartbeat; None: the configured one
 
     @property
     def essential(self) -> bool:
-        """Whether the run fails with it."""
+        """Whether the run fails without it."""
         return not self.without
 
 
 class Intake:
-    """Whether a node takes in what is sent to it: with its heartbeat intact it may have lost its input.
-
-    Stale input is another thing: nothing was sent then.
-    """
+    """Detects a node that has a heartbeat but has lost its input."""
 
     def __init__(self) -> None:
         self._sent = self._taken = -1
         self._since_s = 0.0
 
     def missed(self, sent: int, taken: int, silent_s: float, now_s: float, limit_s: float) -> int:
-        """How many records in a row, where that has gone on for too long; else 0. Counters that fall restart.
+        """Returns the number of consecutive records not received for longer than `limit_s`, else 0.
 
-        A loop that has not beaten for half the limit does not count here: it may be about to count as stalled.
+        A decreasing counter restarts. A node without a heartbeat for half the limit does not count: it may be stalled.
         """
         if taken != self._taken or sent < self._sent:
             self._sent, self._taken, self._since_s = sent, taken, now_s
         missed = sent - self._sent
         late = now_s - self._since_s > limit_s and silent_s <= limit_s / 2.0
-        return missed if missed >= MISSED_RECORDS and late else 0
+        return missed if missed >= MAX_MISSED_RECORDS and late else 0
 
 
 class Silence:
-    """How long a loop beside the pipeline has shown no life: without the time for which it waited for a core, since all
-    others go first, and the next process would wait as long.
+    """The time without a heartbeat of a low-priority process, less the time that it waited for a core.
 
-    From one look to the next the thread that waited longest counts: the main thread, or one that held the interpreter's
-    lock. What is new at a look may have begun right after the last: so long ago where who looks waits for a core too.
+    Between two calls the thread that waited longest counts: the main thread, or one that held the interpreter's lock.
     """
 
     def __init__(self) -> None:
@@ -77,7 +72,7 @@ class Silence:
         self._waited_s: Mapping[int, float] = {}
 
     def own_s(self, beat_ns: int, silent_s: float, waited_s: Mapping[int, float]) -> float:
-        """`waited_s`: for which each thread has waited for a core since it began."""
+        """Returns the time in s; `waited_s` is the total wait for a core of each thread."""
         gained_s = max((s - self._waited_s.get(thread, s) for thread, s in waited_s.items()), default=0.0)
         self._starved_s = gained_s + (self._starved_s if beat_ns == self._beat_ns else 0.0)
         self._beat_ns, self._waited_s = beat_ns, waited_s
@@ -85,21 +80,21 @@ class Silence:
 
 
 class Station:
-    """One node of a run, or its recorder, through all of its processes; it begins at once."""
+    """One node of a run, or its recorder, with all of its processes; starts at once."""
 
     def __init__(self, name: str, configuration: Configuration, directory: Path, duty: Duty = Duty()) -> None:
         self.name = name
         self.duty = duty
         self.log = NodeLog(directory / f"{name}.log")
         self.restarts = Restarts(configuration.runtime)
-        self.due_s: float | None = None  # of the next process, where there is none
+        self.due_s: float | None = None  # start of the next process, if none runs
         self._config = configuration
         self._intake, self._silence = Intake(), Silence()
         self._spare: NodeProcess | None = None
         self._spare_due_s = 0.0
-        self.stall = ""  # why the process at work was ended by the watchdog
-        self._kill_s: float | None = None  # when a stalled process that did not heed SIGTERM is killed
-        self.was_ready = False  # the process at work has been; a recorder that waits for the disk at its end is not
+        self.stall = ""  # why the watchdog ended the active process
+        self._kill_s: float | None = None  # when a stalled process gets SIGKILL after SIGTERM
+        self.was_ready = False  # the active process has been ready; a recorder is no longer ready while it closes
         self._before: Counter[str] = Counter()
         self.process = self._started()
         self._begin()
@@ -112,21 +107,20 @@ class Station:
 
     @property
     def working(self) -> bool:
-        """It runs, or will again."""
+        """Whether it runs, or will be restarted."""
         return self.due_s is not None or self.process.exit_status is None
 
     def total(self, counter: str) -> int:
-        """One of the counters over all processes of the node."""
+        """Returns a counter summed over all processes of the node."""
         return self._before[counter] + self.process.vitals[counter]
 
     # --- restarts ---
 
     @property
     def finished(self) -> bool:
-        """Its process has ended for good: in order, or so that another one would fare no better.
+        """Whether its process has ended and a restart is pointless.
 
-        The end of the source finishes a node even where the watchdog ended it. A recorder that the watchdog ended has
-        closed its file, and nothing more.
+        After the end of the source a node is finished even if the watchdog ended it; a recorder is not.
         """
         status, ended = self.process.exit_status, bool(self.process.vitals["ended"])
         in_order = ended and (status == 0 if self.duty.essential else not self.stall)
@@ -134,16 +128,16 @@ class Station:
 
     @property
     def cause(self) -> str:
-        """Why its process ended."""
+        """The reason why its process ended."""
         return self.stall or self.process.how()
 
     def plan_restart(self) -> bool:
-        """Says when the next process is due; False where they have died too often of late."""
+        """Sets when the next process starts; returns False after too many restarts."""
         self.due_s = self.restarts.died(time.monotonic(), self.cause, self.process.vitals)
         return self.due_s is not None
 
     def restart(self) -> None:
-        """The next process goes to work: the spare, or a new one."""
+        """Starts the next process: the spare or a new one."""
         self.due_s = self._kill_s = None
         self.stall, self.was_ready = "", False
         for counter in _SUMMED:
@@ -155,14 +149,14 @@ class Station:
             spare.close()
             spare = None
         if spare is not None:
-            realtime.raise_from_idle(spare.pid)  # before it is sent its assignment: it may still be loading
+            realtime.raise_from_idle(spare.pid)  # before the assignment: it may still be loading
         self.process = spare or self._started()
         self._begin()
 
     def keep_spare(self) -> bool:
-        """Starts a spare where there is none; whether one stands by, loaded."""
+        """Starts a spare if there is none; returns whether one is loaded."""
         now_s = time.monotonic()
-        if self._spare is not None and self._spare.exit_status is not None:  # it could not load: no hurry with another
+        if self._spare is not None and self._spare.exit_status is not None:  # it could not load: wait before the next
             self._spare.close()
             self._spare = None
             self._spare_due_s = now_s + self._config.runtime.restart_backoff_max_ms / 1e3
@@ -174,7 +168,7 @@ class Station:
     # --- watchdog ---
 
     def stalled(self, before: Station | None) -> str:
-        """Why the process at work is to be ended, or nothing; `before` is the node that sends to it."""
+        """Returns why the active process must be ended, or ""; `before` is the node that sends to it."""
         runtime, process = self._config.runtime, self.process
         limit_s, now_s = self.duty.watchdog_s or self._config.watchdog_s, time.monotonic()
         if process.exit_status is not None or process.begun_s is None or self._kill_s is not None:
@@ -184,31 +178,31 @@ class Station:
         if not self.duty.essential:
             silent_s = self._silence.own_s(process.vitals["beat_ns"], silent_s, waited_s(process.pid))
         if silent_s > limit_s:
-            return f"is stalled: its loop has shown no life for {1e3 * limit_s:g} ms"
+            return f"is stalled: no heartbeat for {1e3 * limit_s:g} ms"
         if before is not None and process.ready:
             sent = before.process.vitals["frames"]
             taken = sum(process.vitals[counter] for counter in ("frames", "torn", "outrun"))
             missed = self._intake.missed(sent, taken, silent_s, now_s, limit_s)
             if missed:
-                return f"has taken in none of the last {missed} frames of {before.name}"
+                return f"has received none of the last {missed} frames of {before.name}"
         since_s = now_s - process.begun_s
         if not self.was_ready and since_s > runtime.ready_timeout_s + runtime.stop_timeout_s:
             return f"was not ready within {since_s:.0f} s"
         return ""
 
     def end(self, stall: str) -> None:
-        """SIGTERM now, SIGKILL after its grace (`enforce`)."""
+        """Sends SIGTERM now, and SIGKILL after the grace period (`enforce`)."""
         self.stall = stall
         self.process.send(signal.SIGTERM)
         self._kill_s = time.monotonic() + self._config.runtime.term_grace_ms / 1e3
 
     def enforce(self) -> None:
-        """Kills a process whose grace is over."""
+        """Kills a process whose grace period is over."""
         if self._kill_s is not None and time.monotonic() > self._kill_s:
             self.process.send(signal.SIGKILL)
 
     def close(self) -> None:
-        """Kills what still runs."""
+        """Kills the processes that still run."""
         self.process.close()
         if self._spare is not None:
             self._spare.close()

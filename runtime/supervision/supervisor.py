@@ -1,7 +1,7 @@
-"""Starts the three processes of a run, its recorder and its map process, watches them, and ends them.
+"""Starts, watches and ends the three processes of a run, its recorder and its map process.
 
-Everything here waits by events: pidfds, signals, the logbook. On SIGINT, SIGTERM and SIGHUP capture ends the source
-there, so that the frames in flight are processed; at a second signal all processes end at once.
+Event driven: pidfds, signals, the logbook. On SIGINT, SIGTERM and SIGHUP capture ends the source, so that the frames
+in flight are processed; on a second signal all processes end at once.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from birdslam.runtime.supervision.map_station import map_station
 from birdslam.runtime.supervision.recording_files import RecordingFiles
 from birdslam.runtime.supervision.stations import Station
 
-START_ORDER = ("optimize", "perceive", "capture")  # each awaits the one before it (runner.py)
-BEFORE = {"perceive": "capture", "optimize": "perceive"}  # who sends to whom
+START_ORDER = ("optimize", "perceive", "capture")  # each waits for the one before it (runner.py)
+BEFORE = {"perceive": "capture", "optimize": "perceive"}  # node -> its sender
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-CHECK_S = 0.1  # watchdogs are looked after at least so often
-MAX_WARNINGS = 5  # at a time; the log has all of them
+CHECK_S = 0.1  # max. interval of the watchdog
+MAX_WARNINGS = 5  # printed at a time; the log has all
 
 
 class Supervisor:
-    """The nodes of one run, and who is there beside them, from their start to their end."""
+    """The nodes of one run, its recorder and its map process, from start to end."""
 
     def __init__(
         self,
@@ -43,7 +43,7 @@ class Supervisor:
         files: RecordingFiles | None = None,
         frames: int | None = None,
     ) -> None:
-        """`frames` is how many the source has, for the time to go; None where it is unknown."""
+        """`frames`: number of frames of the source, for the remaining time; None if unknown."""
         self.failure = ""
         self.exit_status = 0
         self._config = configuration
@@ -54,10 +54,10 @@ class Supervisor:
         self.recorder: Station | None = None
         self.map: Station | None = None
         self._notifier = Notifier()
-        self._disk_said = False
+        self._has_reported_disk = False
         self.nodes: dict[str, Station] = {}
         self._stopped_by: signal.Signals | None = None
-        self._deadline_s: float | None = None  # of a stop that was asked for
+        self._deadline_s: float | None = None  # of a requested stop
         self._selector = selectors.DefaultSelector()
 
     def run(self, logs: Path) -> None:
@@ -85,7 +85,7 @@ class Supervisor:
             self._show()
             self._notifier.once("STOPPING=1")
         if not self.failure and not self._logbook.ended and self._stopped_by is None:
-            self.fail("all nodes ended, but the end of the source never came back", 1)
+            self.fail("all nodes ended, but END_OF_SOURCE was not received", 1)
 
     def _add(self, station: Station, stack: ExitStack) -> None:
         stack.callback(station.close)
@@ -100,7 +100,7 @@ class Supervisor:
         return tuple(station for station in (self.recorder, self.map) if station is not None)
 
     def _end_beside(self, timeout_s: float) -> None:
-        """Lets recorder and map write what they have received, and end their files."""
+        """Lets recorder and map process write what they have received and close their files."""
         self._stop_by(timeout_s)
         for station in self._beside:
             station.process.send(signal.SIGTERM)
@@ -113,7 +113,7 @@ class Supervisor:
 
     def _signal(self, signals: socket.socket) -> None:
         for number in signals.recv(64):
-            if self._stopped_by is not None:  # asked twice: no more patience
+            if self._stopped_by is not None:  # second signal: end at once
                 self._send_all(signal.SIGTERM)
                 continue
             self._stopped_by = signal.Signals(number)
@@ -121,7 +121,7 @@ class Supervisor:
             self.exit_status = self.exit_status or (INTERRUPTED_STATUS if number == signal.SIGINT else 0)
             capture = self.nodes.get("capture")
             if capture is not None and capture.process.ready and capture.process.exit_status is None:
-                capture.process.send(signal.SIGINT)  # END_OF_SOURCE then runs through all
+                capture.process.send(signal.SIGINT)  # END_OF_SOURCE then passes through all nodes
             else:
                 self._send_all(signal.SIGTERM)
             self._stop_by(self._config.runtime.stop_timeout_s)
@@ -139,22 +139,21 @@ class Supervisor:
             self._stop_by(self._config.runtime.stop_timeout_s)
 
     def _process_ended(self, pidfd: int) -> None:
-        """One rule for all: what has not finished is restarted, where that may be; else the run fails with it, or goes
-        on without it."""
+        """Restarts an unfinished process if allowed; else the run fails, or continues without it."""
         self._selector.unregister(pidfd)
         station = next(station for station in self._stations if station.process.pidfd == pidfd)
         process, essential = station.process, station.duty.essential
         stopping = self._deadline_s is not None
         status, at_first = process.exit_status, not process.ready and not station.restarts.count
         if station.finished or (stopping and essential and status in (0, None, -signal.SIGTERM)):
-            return  # SIGTERM: before it could handle the signal
+            return  # -SIGTERM: it ended before its signal handler was set
         may_restart = self._config.restarts and not stopping and not (essential and at_first)
         if may_restart and station.plan_restart():
-            self._live.say(process.failure(station.cause, "; it is restarted"))
+            self._live.say(process.failure(station.cause, "; it is being restarted"))
             if station.due_s is not None and station.due_s <= time.monotonic():
                 self._restart(station)
         elif not essential:
-            self._live.say(process.failure(station.cause, f"; {station.duty.without}, the run goes on"))
+            self._live.say(process.failure(station.cause, f"; {station.duty.without}, the run continues"))
         elif may_restart:
             window_s = self._config.runtime.restart_window_s
             again = f"{self._config.runtime.restarts_max + 1} times in {window_s:g} s: it is not restarted"
@@ -181,17 +180,17 @@ class Supervisor:
                 self._restart(station)
         if self._deadline_s is None and all(node.process.ready for node in nodes):
             self._notifier.once("READY=1")
-            if self._config.spares:  # one after the other, so that loading them takes one core at the most
+            if self._config.spares:  # one after the other, so that loading takes at most one core
                 all(node.keep_spare() for node in nodes)
         if self._deadline_s is not None and now_s > self._deadline_s:
             still = [node.name for node in nodes if node.process.exit_status is None]
             if still:
                 limit_s = self._config.runtime.stop_timeout_s
-                self.fail(f"{', '.join(still)} did not end within {limit_s:g} s of being asked to", 1)
+                self.fail(f"{', '.join(still)} did not end within {limit_s:g} s of the signal", 1)
             self._send_all(signal.SIGKILL)
 
     def fail(self, reason: str, exit_status: int) -> None:
-        """The first failure is the reason; what follows is its consequence."""
+        """Ends the run with a failure; later failures are ignored as its consequences."""
         if self.failure:
             return
         self.failure, self.exit_status = reason, exit_status
@@ -210,9 +209,9 @@ class Supervisor:
                 self._live.say(f"{station.name}: {line}")
             if len(warnings) > MAX_WARNINGS:
                 self._live.say(f"{station.name}: {len(warnings) - MAX_WARNINGS} more warnings in {station.log.path}")
-        if self._logbook.unwritten is not None and not self._disk_said:
-            self._disk_said = True
-            self._live.say(f"results are not written any more: {self._logbook.unwritten}")
+        if self._logbook.unwritten is not None and not self._has_reported_disk:
+            self._has_reported_disk = True
+            self._live.say(f"results are no longer written: {self._logbook.unwritten}")
         status = self._logbook.status_line(self._frames)
         if self._files is not None and self.recorder is not None:
             status = f"{status}  {self._files.status(self.recorder)}"
@@ -221,7 +220,7 @@ class Supervisor:
 
     @property
     def ended(self) -> str:
-        """How the run ended, for the summary."""
+        """The reason for the end of the run, for the summary."""
         if self.failure:
             return self.failure
         if self._stopped_by is not None:
@@ -231,7 +230,7 @@ class Supervisor:
 
 @contextmanager
 def _signals() -> Iterator[socket.socket]:
-    """A socket from which the numbers of these signals are read, instead of what they do otherwise."""
+    """Redirects STOP_SIGNALS to a socket, from which their numbers are read."""
     reader, writer = socket.socketpair()
     with reader, writer:
         writer.setblocking(False)
@@ -246,4 +245,4 @@ def _signals() -> Iterator[socket.socket]:
 
 
 def _ignore(number: int, frame: FrameType | None) -> None:
-    """The wake-up socket has it."""
+    """Does nothing: the wake-up socket has the signal."""

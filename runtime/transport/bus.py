@@ -1,9 +1,8 @@
 """The bus: one node's zenoh session, with typed publishers, bounded subscribers and liveliness.
 
-Everything stays on this machine: unix sockets in a directory of the vehicle (0700), no TCP, no multicast, no shared
-memory of zenoh's. The hub (the supervisor) listens on `hub.sock`, every node of the topology on a socket of its own,
-and they find each other by gossip through the hub; all others (planners) only connect. Nobody needs to be the first.
-Never fork after a Bus was opened (spawn instead), and always close it: zenoh's threads call until then.
+Local only: unix sockets in a directory of the vehicle (0700), no TCP, multicast or zenoh shared memory. The hub (the
+supervisor) listens on `hub.sock`, each node on its own socket; they discover each other by gossip through the hub.
+Other processes (planners) only connect. Never fork after opening a Bus (spawn instead), and always close it.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ __all__ = ["Bus", "BusClosed", "BusError", "Message", "MessagesLost", "Publisher
 
 
 class Bus(Closing):
-    """One node's session on its vehicle's bus. A context manager; `close` it always.
+    """One node's session on its vehicle's bus. A context manager; must be closed.
 
         with Bus("car", "perceive") as bus:
             frames, out = bus.subscriber("frame"), bus.publisher("measurements")
@@ -47,9 +46,9 @@ class Bus(Closing):
             message = frames.recv(timeout_s=0.5)                       # Message | None
             out.put(record, message.trace.after("perceive", message.t_received_ns, done_ns))
 
-    `hub` is the supervisor's: the socket that everybody connects to. `lossless` sends with back pressure and queues
-    deep, for runs in which every frame counts (`--rate max`): all nodes and readers of such a run must be lossless.
-    Raises ValueError for a bad vehicle or node name, BusError where the sockets can't be made.
+    `hub`: listen on the socket that all others connect to. `lossless`: send with back pressure and long queues, for
+    runs at rate "max"; then all nodes and readers must be lossless. Raises ValueError for an invalid vehicle or node
+    name, BusError if the sockets can't be created.
     """
 
     def __init__(
@@ -74,21 +73,21 @@ class Bus(Closing):
         except zenoh.ZError as error:
             where = ", ".join(map(str, listen)) or hub_socket
             raise BusError(f"{node} can't join the bus of vehicle {vehicle!r} ({where}): {error}") from error
-        if node not in PROCESSES:  # planners and other readers: of what comes they know at once
+        if node not in PROCESSES:  # wake planners and other readers without delay
             wake_soon(own_threads() - before)
         callback = zenoh.handlers.Callback(self._liveliness_changed, indirect=False)
         key = alive_key(vehicle, "*")
         self._liveliness = self._session.liveliness().declare_subscriber(key, callback, history=True)
 
     def publisher(self, topic: str) -> Publisher:
-        """A publisher of `topic`. Raises KeyError for a topic that the topology does not have."""
+        """Returns a publisher of `topic`. Raises KeyError for an unknown topic."""
         self._check_open()
         key, spec = key_of(self.vehicle, topic), TOPICS[topic]
         self._publishers.append(Publisher(self._session, key, spec, self.node, self._lossless))
         return self._publishers[-1]
 
     def subscriber(self, topic: str, depth: int | None = None) -> Subscriber:
-        """A subscriber of `topic`; `depth` replaces the topology's. Raises KeyError for an unknown topic."""
+        """Returns a subscriber of `topic`; `depth` replaces the topology's. Raises KeyError for an unknown topic."""
         self._check_open()
         key, spec = key_of(self.vehicle, topic), TOPICS[topic]
         depth = spec.depth if depth is None else depth
@@ -99,13 +98,13 @@ class Bus(Closing):
         return self._subscribers[-1]
 
     def catch_up(self, topic: str, subscriber: Subscriber) -> None:
-        """Gives a subscriber that came late the topic's last message, when it comes; waits for nothing."""
+        """Queries the topic's last message for a late subscriber, in the background."""
         query_in_background(self._session, key_of(self.vehicle, topic), subscriber._receive_retained)
 
     def retained(self, topic: str, timeout_s: float = REPLY_S) -> list[Message]:
-        """The topic's retained messages (Topic.retained), oldest first; empty where no reply comes in time.
+        """Returns the topic's retained messages (Topic.retained), oldest first; empty without a reply in time.
 
-        Raises BusError where one is no such record.
+        Raises BusError for a malformed message.
         """
         key, record = key_of(self.vehicle, topic), TOPICS[topic].record
         try:
@@ -115,9 +114,9 @@ class Bus(Closing):
             raise BusError(f"{topic}: a retained message is malformed: {error}") from error
 
     def query(self, name: str, timeout_s: float = REPLY_S, **parameters: float) -> list[Any]:
-        """The parts of the reply to one of topology.QUERIES, in order; empty where no reply comes in time.
+        """Returns the parts of the reply to one of topology.QUERIES, in order; empty without a reply in time.
 
-        Raises BusError with the reason where the query is refused, or where the reply is incomplete or malformed.
+        Raises BusError with the reason if the query is refused, or the reply is incomplete or malformed.
         """
         self._check_open()
         return whole_reply(self._session, self.vehicle, name, timeout_s, parameters)
@@ -129,19 +128,19 @@ class Bus(Closing):
         self._responders.append(QueryResponder(self._session, by_key))
 
     def declare_alive(self) -> None:
-        """Says that this node is ready for work; taken back by close, or by the death of the process."""
+        """Declares this node alive until it is closed or its process dies."""
         self._check_open()
         if self._token is None:
             self._token = self._session.liveliness().declare_token(alive_key(self.vehicle, self.node))
 
     @property
     def alive(self) -> frozenset[str]:
-        """The nodes that are alive now, as far as this session knows."""
+        """The nodes that this session sees alive."""
         with self._alive_changed:
             return frozenset(self._alive)
 
     def wait_alive(self, nodes: Iterable[str], timeout_s: float) -> set[str]:
-        """Waits until all of `nodes` are alive at once; gives those still missing. Raises BusClosed."""
+        """Waits until all of `nodes` are alive at once; returns the missing ones. Raises BusClosed."""
         wanted = set(nodes)
         with self._alive_changed:
             self._alive_changed.wait_for(lambda: self._closed or wanted <= self._alive, timeout_s)
@@ -149,8 +148,9 @@ class Bus(Closing):
             return wanted - self._alive
 
     def on_alive(self, callback: Callable[[str, bool], None]) -> None:
-        """Calls `callback(node, True)` for each node that is alive now, and `callback(node, alive)` at each change from
-        now on, on zenoh's thread: it must be quick.
+        """Calls `callback(node, True)` for each alive node, and `callback(node, alive)` at each later change.
+
+        Later calls are on zenoh's thread and must return quickly.
         """
         with self._alive_changed:
             self._alive_callbacks.append(callback)
@@ -172,7 +172,7 @@ class Bus(Closing):
             raise BusClosed(f"the bus of vehicle {self.vehicle!r} is closed")
 
     def close(self) -> None:
-        """Leaves the bus; waiting calls raise BusClosed. A second call does nothing."""
+        """Closes the session; waiting calls raise BusClosed. A second call does nothing."""
         with self._alive_changed:
             if self._closed:
                 return

@@ -1,4 +1,4 @@
-"""What is closed at the end of a `with` block: buses, rings, locks and all that holds one of them."""
+"""The context manager base of buses, rings and locks."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import Self
 
 
 class Closing(ABC):
-    """A context manager that is itself what it gives."""
+    """A context manager that returns itself and calls `close` on exit."""
 
     @abstractmethod
     def close(self) -> None:
-        """Lets go of what it holds."""
+        """Releases its resources."""
 
     def __enter__(self) -> Self:
         return self

@@ -1,4 +1,4 @@
-"""Publisher and subscriber of one topic: typed, with a bounded queue of messages; made by bus.Bus."""
+"""Typed publisher and subscriber of one topic, with a bounded queue; created by bus.Bus."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from birdslam.runtime.topology import Topic
 from birdslam.runtime.transport.queries import RetainedMessages
 from birdslam.runtime.wire import MAX_TRACE_BYTES, Stage, Trace, WireError, decode, encode
 
-UNPACKED = 16  # messages that wait as records; an estimate is 29 kB of memory so, and 2 to 12 as bytes
+MAX_UNPACKED = 16  # messages queued as records; as bytes they need less memory
 
 log = logging.getLogger(__name__)
 
@@ -24,7 +24,7 @@ _Attached = TypeVar("_Attached", bound=msgspec.Struct)
 
 
 class BusError(RuntimeError):
-    """The bus can't do what was asked; says why."""
+    """A bus operation failed; the message has the reason."""
 
 
 class BusClosed(BusError):
@@ -32,12 +32,12 @@ class BusClosed(BusError):
 
 
 class MessagesLost(BusError):
-    """A queue of a lossless bus was full: the run is no longer what it promised to be."""
+    """A queue of a lossless bus was full: the run is incomplete."""
 
 
 @dataclass(frozen=True)
 class Message:
-    """A record of the topic's type, where its time went, and when it came in (CLOCK_MONOTONIC)."""
+    """A record of the topic's type, its trace, and its time of arrival (CLOCK_MONOTONIC)."""
 
     record: Any
     trace: Trace
@@ -46,7 +46,7 @@ class Message:
 
 @dataclass(frozen=True)
 class _Packed:
-    """A message that waits behind many others: valid, and as it was sent."""
+    """A valid message deep in the queue, as encoded bytes."""
 
     payload: bytes
     trace: Trace
@@ -54,7 +54,7 @@ class _Packed:
 
 
 def message_of(sample: zenoh.Sample, key: str, record: type[msgspec.Struct]) -> Message:
-    """What came in now, decoded. Raises WireError where it is no such record, or was sent to more keys than this."""
+    """Decodes a message received now. Raises WireError if it is invalid or was sent to more keys than this."""
     t_received_ns = time.monotonic_ns()
     if str(sample.key_expr) != key or sample.kind != zenoh.SampleKind.PUT:
         raise WireError(f"sent as {sample.kind} to {sample.key_expr}")
@@ -68,9 +68,9 @@ def attached(sample: zenoh.Sample, kind: type[_Attached]) -> _Attached | None:
 
 
 class Publisher:
-    """Sends the records of one topic; made by Bus.publisher.
+    """Sends the records of one topic; created by Bus.publisher.
 
-    `express`: each message at once and by itself; without it zenoh joins those that wait for the link.
+    `express`: send each message at once; without it zenoh batches the messages that wait for the link.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class Publisher:
         self._changed = threading.Condition()
         self._closed = False
         self._sent = 0
-        self._matched: bool | None = None  # a copy: zenoh is never called while the lock is held
+        self._matched: bool | None = None  # a copy, so that zenoh is not called while the lock is held
         self._publisher = session.declare_publisher(
             key,
             congestion_control=zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP,
@@ -94,7 +94,7 @@ class Publisher:
         self._listener = self._publisher.declare_matching_listener(callback)
         at_first: zenoh.MatchingStatus = self._publisher.matching_status  # type: ignore[assignment]
         with self._changed:
-            if self._matched is None:  # else a change has come already
+            if self._matched is None:  # else the listener was called before
                 self._matched = at_first.matching
 
     def _matching_changed(self, status: zenoh.MatchingStatus) -> None:
@@ -104,11 +104,11 @@ class Publisher:
 
     @property
     def matched(self) -> bool:
-        """Whether somebody subscribes to this topic now."""
+        """Whether the topic has a subscriber."""
         return bool(self._matched) and not self._closed
 
     def wait_matched(self, timeout_s: float) -> bool:
-        """Waits for a first subscriber; False where none came in time. Raises BusClosed."""
+        """Waits for a subscriber; returns False if there is none in time. Raises BusClosed."""
         with self._changed:
             matched = self._changed.wait_for(lambda: self._closed or self.matched, timeout_s)
         if self._closed:
@@ -116,11 +116,11 @@ class Publisher:
         return matched
 
     def put(self, record: msgspec.Struct, trace: Trace | None = None, must_arrive: bool = False) -> None:
-        """Sends a record, and stamps its sending into the last stage of `trace` (None: it begins here and now).
+        """Sends a record and stamps the time in the last stage of `trace` (None: a new trace).
 
-        A reader that is too slow costs messages, not time: the lossy bus waits 1 ms at the most for a full link, and
-        drops the record. One that `must_arrive` waits until the link has room, or is given up.
-        Raises WireError (a record that is too large), BusClosed, and TypeError for a record of another type.
+        The lossy bus waits at most 1 ms for a full link, then drops the record; with `must_arrive` it waits until the
+        link has room or is closed.
+        Raises WireError for a record that is too large, BusClosed, and TypeError for a record of another type.
         """
         if type(record) is not self._topic.record:
             raise TypeError(f"{self._topic.name} takes {self._topic.record.__name__}, not {type(record).__name__}")
@@ -132,7 +132,7 @@ class Publisher:
         if self._retained is not None:
             self._retained.add(data, attachment)
         try:
-            if must_arrive:  # of the same priority: it stays behind the records before it
+            if must_arrive:  # the same priority keeps the order of the records
                 self._session.put(
                     self._key,
                     data,
@@ -155,12 +155,11 @@ class Publisher:
 
 
 class Subscriber:
-    """A bounded queue of one topic's messages; made by Bus.subscriber.
+    """A bounded queue of one topic's messages; created by Bus.subscriber.
 
-    `newest` is the last message that came in, whether it was read or not. `dropped` counts the messages that were lost
-    on the way here (its sender numbers them) and those that a newer one pushed out of the full queue, `malformed` those
-    that were no valid record, or were sent to more keys than this: on the lossy bus they may count as lost too. Behind
-    UNPACKED messages others wait as bytes, so that a reader that was held up has not grown by it.
+    `newest`: the last received message, read or not. `dropped`: messages lost in transit (by their numbers) and dropped
+    from the full queue. `malformed`: invalid messages, which on the lossy bus may count as dropped too. Messages after
+    the first MAX_UNPACKED are queued as bytes, to limit memory.
     """
 
     def __init__(self, session: zenoh.Session, key: str, topic: Topic, depth: int, lossless: bool) -> None:
@@ -171,7 +170,7 @@ class Subscriber:
         self.newest: Message | None = None
         self.dropped = 0
         self.malformed = 0
-        # Called on zenoh's own thread: one hop fewer, and the messages of a sender keep their order over all topics.
+        # Called on zenoh's thread: less latency, and the messages of a sender keep their order over all topics.
         callback = zenoh.handlers.Callback(self._receive, indirect=False)
         self._subscriber = session.declare_subscriber(key, callback)
 
@@ -181,29 +180,29 @@ class Subscriber:
         except WireError as error:
             self.malformed += 1
             if self.malformed == 1:
-                log.warning("%s: a malformed message is ignored, and all that follow: %s", self._key, error)
+                log.warning("%s: ignored a malformed message; later ones are only counted: %s", self._key, error)
             return
         with self._arrived:
-            if _is_again(self.newest, message):
+            if _is_duplicate(self.newest, message):
                 return
             self.dropped += _lost_between(self.newest, message)
             self.dropped += len(self._queue) == self._queue.maxlen
             self.newest = message
-            if len(self._queue) < UNPACKED:
+            if len(self._queue) < MAX_UNPACKED:
                 self._queue.append(message)
             else:
                 self._queue.append(_Packed(bytes(sample.payload), message.trace, message.t_received_ns))
             self._arrived.notify()
 
     def _receive_retained(self, reply: zenoh.Reply) -> None:
-        """A message of before this subscription; it counts only where none came since."""
+        """Receives a message from before this subscription, unless a newer one has arrived."""
         if reply.ok is not None and self.newest is None:
             self._receive(reply.ok)
 
     def recv(self, timeout_s: float | None = None) -> Message | None:
-        """The next message, as soon as there is one; None where none came within `timeout_s` (None: no limit).
+        """Waits for the next message; returns None if none arrives within `timeout_s` (None: no limit).
 
-        Raises BusClosed once closed, from another thread too; on a lossless bus MessagesLost where the queue was full.
+        Raises BusClosed after `close`, also from another thread; on a lossless bus MessagesLost if the queue was full.
         """
         with self._arrived:
             self._arrived.wait_for(lambda: self._closed or self._queue, timeout_s)
@@ -227,13 +226,13 @@ class Subscriber:
         self._subscriber.undeclare()
 
 
-def _is_again(earlier: Message | None, later: Message) -> bool:
-    """Whether it is the same message: asked for as the topic's last one, and sent meanwhile."""
+def _is_duplicate(earlier: Message | None, later: Message) -> bool:
+    """Whether both are the same message: queried as the retained one, and sent meanwhile."""
     return earlier is not None and later.trace.number > 0 and later.trace == earlier.trace
 
 
 def _lost_between(earlier: Message | None, later: Message) -> int:
-    """How many of their publisher's messages lie between two; none where it was restarted, or is another one."""
+    """Returns the number of messages lost between two of one publisher; 0 after its restart."""
     if earlier is None or not (earlier.trace.stages and later.trace.stages and earlier.trace.number):
         return 0
     if earlier.trace.stages[-1].node != later.trace.stages[-1].node:

@@ -1,8 +1,7 @@
-"""Where a vehicle's sockets and rings lie, and the lock that lets only one instance of it run.
+"""The runtime directory of a vehicle with its sockets, its ring of frames, and the lock for one instance.
 
-The runtime directory of a vehicle is `$XDG_RUNTIME_DIR/birdslam/<vehicle>`, or `/tmp/birdslam-<uid>/<vehicle>` where
-there is no such variable. It belongs to one user alone (0700), and holds the sockets, the lock, and where there is no
-/dev/shm the frames too.
+The directory is `$XDG_RUNTIME_DIR/birdslam/<vehicle>`, or `/tmp/birdslam-<uid>/<vehicle>` without that variable. It
+is private to one user (0700). Without /dev/shm it also holds the frames.
 """
 
 from __future__ import annotations
@@ -22,17 +21,17 @@ from birdslam.runtime.transport.closing import Closing
 
 _MAX_SOCKET_PATH_BYTES = 107  # sun_path of Linux, without its final zero
 _SHARED_MEMORY = Path("/dev/shm")
-_OWN = "own-"  # then a process' number: the runtime directory of one that drives over a recording
+_OWN = "own-"  # followed by a PID: the private runtime directory of a run over a recording
 
 
 class VehicleBusy(RuntimeError):
-    """Another instance runs under the name of this vehicle; names its process and lock file."""
+    """Another instance of this vehicle runs; the message names its process and lock file."""
 
 
 def runtime_dir_of(vehicle: str, runtime_dir: Path | None = None) -> Path:
-    """The vehicle's directory inside `runtime_dir`, made where it does not exist.
+    """Returns the vehicle's directory inside `runtime_dir`; creates it if needed.
 
-    Raises ValueError for a bad vehicle name, PermissionError where the directory is open to other users.
+    Raises ValueError for an invalid vehicle name, PermissionError if other users can access the directory.
     """
     check_name("vehicle", vehicle)
     directory = (_users_runtime_dir() if runtime_dir is None else runtime_dir) / vehicle
@@ -51,10 +50,10 @@ def _users_runtime_dir() -> Path:
 
 @contextlib.contextmanager
 def own_runtime_dir(vehicle: str) -> Iterator[Path]:
-    """A runtime directory for this process alone, gone afterwards: a bus on which nobody else is.
+    """Creates a temporary runtime directory, hence a private bus, for this process.
 
-    So that drives over recordings run side by side, and never stand in the way of the car that bears the name. Removes
-    too what such processes left that were killed.
+    Runs over recordings can then run in parallel, and beside a vehicle of the same name. Also removes the directories
+    of killed processes.
     """
     place = _users_runtime_dir()
     for left in place.glob(f"{_OWN}*"):
@@ -76,7 +75,7 @@ def _remove_left(directory: Path) -> None:
     for lock in directory.glob("*/lock"):
         try:
             VehicleLock(lock.parent.name, directory).close()  # its sockets and its ring
-        except (VehicleBusy, OSError, ValueError):  # of another container, which has its own process numbers
+        except (VehicleBusy, OSError, ValueError):  # of another container with its own PIDs
             return
     shutil.rmtree(directory, ignore_errors=True)
 
@@ -91,7 +90,7 @@ def _check_private(directory: Path) -> None:
 
 
 def socket_path(directory: Path, name: str) -> Path:
-    """The path of a unix socket in a runtime directory. Raises ValueError where it is too long for one."""
+    """Returns the path of a unix socket in a runtime directory. Raises ValueError if it is too long."""
     path = directory / f"{name}.sock"
     if (size := len(os.fsencode(path))) > _MAX_SOCKET_PATH_BYTES:
         raise ValueError(
@@ -102,19 +101,19 @@ def socket_path(directory: Path, name: str) -> Path:
 
 
 def ring_path(vehicle: str, runtime_dir: Path | None = None) -> Path:
-    """Where the ring of a vehicle's frames lies: in shared memory, else in its runtime directory."""
+    """Returns the path of a vehicle's ring of frames: in shared memory, else in its runtime directory."""
     directory = runtime_dir_of(vehicle, runtime_dir)
     if not os.access(_SHARED_MEMORY, os.W_OK):
         return directory / "frames.ring"
-    place = hashlib.sha256(os.fsencode(directory)).hexdigest()[:8]  # two runtime directories, two rings
+    place = hashlib.sha256(os.fsencode(directory)).hexdigest()[:8]  # one ring per runtime directory
     return _SHARED_MEMORY / f"birdslam-{os.getuid()}-{vehicle}-{place}.ring"
 
 
 class VehicleLock(Closing):
-    """One running instance for each vehicle name. A context manager, held by the supervisor.
+    """A lock for one running instance per vehicle name. A context manager, held by the supervisor.
 
-    The kernel frees it with its process, by kill -9 too. Whoever gets it removes what dead processes left behind.
-    Raises VehicleBusy where another process holds it. A forked child would hold it on: spawn instead.
+    The kernel releases it when the process dies. Its new owner removes the files of dead processes. Raises VehicleBusy
+    if another process holds it. A forked child would keep it: spawn instead.
     """
 
     def __init__(self, vehicle: str, runtime_dir: Path | None = None) -> None:
@@ -137,7 +136,7 @@ class VehicleLock(Closing):
         self._ring.unlink(missing_ok=True)
 
     def close(self) -> None:
-        """Removes what nodes that had to be killed left behind, and frees the name; a second call does nothing."""
+        """Removes the files of killed nodes and releases the lock; a second call does nothing."""
         if self._fd >= 0:
             self._clean()
             os.ftruncate(self._fd, 0)
@@ -146,7 +145,7 @@ class VehicleLock(Closing):
 
 
 def _remove_dead_sockets(directory: Path) -> None:
-    """Removes sockets without a listener; a process that outlived its supervisor keeps its own."""
+    """Removes sockets without a listener; a process that outlived its supervisor keeps its socket."""
     for path in directory.glob("*.sock"):
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
             try:
@@ -156,7 +155,7 @@ def _remove_dead_sockets(directory: Path) -> None:
 
 
 def remove_socket(directory: Path, name: str) -> None:
-    """Removes the socket of a process that is known to be dead."""
+    """Removes the socket of a dead process."""
     _remove_socket(socket_path(directory, name))
 
 

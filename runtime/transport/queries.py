@@ -1,8 +1,7 @@
-"""Queries of the bus, by zenoh, each answered with records of one type.
+"""Queries of the bus over zenoh, each answered with records of one type.
 
-A publisher of a topic with retained messages (`Topic.retained`) answers with them, from the bytes that it sent. Other
-queries (`QueryResponder`) are answered in a thread of their own, behind a short queue: who queries too much gets no
-reply, and nothing else is slowed down.
+A publisher of a topic with retained messages (`Topic.retained`) replies with the bytes that it sent. `QueryResponder`
+answers other queries in a thread with a short queue, so that a flood of queries delays nothing else.
 """
 
 from __future__ import annotations
@@ -27,11 +26,11 @@ log = logging.getLogger(__name__)
 
 
 class QueryRefused(ValueError):
-    """A query that can't be answered: its sender gets the reason."""
+    """A query that can't be answered; its sender receives the reason."""
 
 
 class RetainedMessages:
-    """The last messages of one publisher, for those that come late. Answers on zenoh's own thread: nothing is made."""
+    """The last messages of one publisher, for late subscribers. Replies on zenoh's thread."""
 
     def __init__(self, session: zenoh.Session, key: str, count: int) -> None:
         self._key = key
@@ -39,21 +38,21 @@ class RetainedMessages:
         self._queryable = session.declare_queryable(key, zenoh.handlers.Callback(self._answer, indirect=False))
 
     def add(self, data: bytes, attachment: bytes) -> None:
-        """One more; the oldest goes."""
+        """Adds a message; removes the oldest if full."""
         self._messages.append((data, attachment))
 
     def _answer(self, query: zenoh.Query) -> None:
         with query:
-            if str(query.key_expr) != self._key:  # a wildcard: a query for everything gets nothing
+            if str(query.key_expr) != self._key:  # wildcards get no reply
                 return
             for data, attachment in tuple(self._messages):
                 query.reply(self._key, data, attachment=attachment)
 
 
 class QueryResponder:
-    """Answers queries of several keys, one after the other; `close` it before its session.
+    """Answers queries of several keys in sequence; close it before its session.
 
-    `handlers`: key -> what makes the parts of the reply from the query's parameters; it may raise QueryRefused.
+    `handlers`: key -> function from the query's parameters to the parts of the reply; may raise QueryRefused.
     """
 
     def __init__(self, session: zenoh.Session, handlers: Mapping[str, QueryHandler]) -> None:
@@ -69,7 +68,7 @@ class QueryResponder:
     def _enqueue(self, query: zenoh.Query) -> None:
         with self._arrived:
             if not self._closed:
-                self._waiting.append(query)  # the oldest gives way: its sender may query again
+                self._waiting.append(query)  # drops the oldest query if full
                 self._arrived.notify()
 
     def _run(self) -> None:
@@ -93,11 +92,11 @@ class QueryResponder:
                 query.reply(key, encode(part), attachment=encode(Part(number, len(parts))))
         except (QueryRefused, WireError) as error:
             query.reply_err(str(error)[:_REASON_CHARACTERS])
-        except zenoh.ZError as error:  # its sender is gone
+        except zenoh.ZError as error:  # its sender has disconnected
             log.info("%s: no reply: %s", key, error)
 
     def close(self) -> None:
-        """Answers nothing more; a second call does nothing."""
+        """Stops answering; a second call does nothing."""
         with self._arrived:
             if self._closed:
                 return
@@ -115,7 +114,7 @@ def _parameters(query: zenoh.Query) -> dict[str, str]:
 
 
 def positive(parameters: Mapping[str, str], name: str) -> float | None:
-    """One parameter of a query as a number; None where it was left out. Raises QueryRefused, which names it."""
+    """Returns a query parameter as a positive number; None if absent. Raises QueryRefused with its name."""
     text = parameters.get(name)
     if text is None:
         return None

@@ -1,4 +1,4 @@
-"""The asking side of a query: what came back, whole or not at all."""
+"""The client side of queries: collects replies, complete or not at all."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from birdslam.runtime.topology import QUERIES, key_of
 from birdslam.runtime.transport.endpoints import BusError, attached
 from birdslam.runtime.wire import Part, WireError, decode
 
-REPLY_S, _REPLIES = 2.0, 256  # how long a query waits, and how many messages its reply may have
+REPLY_S, _MAX_REPLIES = 2.0, 256  # timeout of a query, and messages of its reply
 
 
 def replies(session: zenoh.Session, selector: str | zenoh.Selector, timeout_s: float) -> Iterator[zenoh.Sample]:
-    """The messages that answer a query, as they come. Raises BusError with the reason where it is refused."""
+    """Yields the messages of a reply as they arrive. Raises BusError with the reason if the query is refused."""
     found = session.get(
         selector,
-        zenoh.handlers.FifoChannel(_REPLIES),
+        zenoh.handlers.FifoChannel(_MAX_REPLIES),
         timeout=timeout_s,
         consolidation=zenoh.ConsolidationMode.NONE,  # all of them, not the last one alone
     )
@@ -30,9 +30,9 @@ def replies(session: zenoh.Session, selector: str | zenoh.Selector, timeout_s: f
 
 
 def query_in_background(session: zenoh.Session, key: str, callback: Callable[[zenoh.Reply], None]) -> None:
-    """Hands what answers a query to `callback`, on zenoh's thread, as it comes; waits for nothing.
+    """Sends a query and passes its replies to `callback` on zenoh's thread, without waiting.
 
-    It may itself be called on zenoh's thread while another one closes the session: then there is nothing to be had.
+    Does nothing if the session is being closed.
     """
     try:
         session.get(key, zenoh.handlers.Callback(callback, indirect=False), timeout=REPLY_S)
@@ -44,9 +44,9 @@ def query_in_background(session: zenoh.Session, key: str, callback: Callable[[ze
 def whole_reply(
     session: zenoh.Session, vehicle: str, name: str, timeout_s: float, parameters: Mapping[str, float]
 ) -> list[Any]:
-    """The parts of a vehicle's reply to one of topology.QUERIES, in order; empty where no reply comes in time.
+    """Returns the parts of a vehicle's reply to one of topology.QUERIES, in order; empty without a reply in time.
 
-    Raises BusError with the reason where the query is refused, or where the reply is incomplete or malformed.
+    Raises BusError with the reason if the query is refused, or the reply is incomplete or malformed.
     """
     spec, key = QUERIES[name], key_of(vehicle, name)
     given = {parameter: f"{value:g}" for parameter, value in parameters.items()}
@@ -59,5 +59,5 @@ def whole_reply(
     except WireError as error:
         raise BusError(f"{name}: the reply is malformed: {error}") from error
     if sorted(parts) != list(range(of)):
-        raise BusError(f"{name}: {len(parts)} of the reply's {of} parts came")
+        raise BusError(f"{name}: received {len(parts)} of the reply's {of} parts")
     return [parts[number] for number in range(of)]

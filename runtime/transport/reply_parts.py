@@ -1,4 +1,4 @@
-"""Replies that are too large for one message, in parts and whole again."""
+"""Splits replies that are too large for one message into parts, and joins them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ PART_POSES = 800  # of some 50 B each
 
 
 def map_parts(snapshot: MapSnapshot) -> list[MapSnapshot]:
-    """The same map in parts that fit a message each."""
+    """Splits a map into parts that each fit into a message."""
     starts = range(0, max(len(snapshot.landmarks_m), len(snapshot.lanes_m), 1), PART_POINTS // 2)
     return [
         msgspec.structs.replace(
@@ -27,7 +27,7 @@ def map_parts(snapshot: MapSnapshot) -> list[MapSnapshot]:
 
 
 def whole_map(parts: Sequence[MapSnapshot]) -> MapSnapshot:
-    """What `map_parts` took apart."""
+    """Joins the parts of `map_parts`."""
     return msgspec.structs.replace(
         parts[-1],
         landmarks_m=tuple(point for part in parts for point in part.landmarks_m),
@@ -37,7 +37,7 @@ def whole_map(parts: Sequence[MapSnapshot]) -> MapSnapshot:
 
 
 def trajectory_parts(trajectory: Trajectory) -> list[Trajectory]:
-    """The same in parts: the ego's poses first, then the vehicles' paths, each of them whole."""
+    """Splits a trajectory: first the ego's poses, then the vehicles' paths, each path undivided."""
     ego = trajectory.ego
     egos = [ego[start : start + PART_POSES] for start in range(0, max(len(ego), 1), PART_POSES)]
     parts = [msgspec.structs.replace(trajectory, ego=poses, vehicles=()) for poses in egos]
@@ -51,7 +51,7 @@ def trajectory_parts(trajectory: Trajectory) -> list[Trajectory]:
 
 
 def whole_trajectory(parts: Sequence[Trajectory]) -> Trajectory:
-    """What `trajectory_parts` took apart."""
+    """Joins the parts of `trajectory_parts`."""
     return msgspec.structs.replace(
         parts[-1],
         ego=tuple(pose for part in parts for pose in part.ego),

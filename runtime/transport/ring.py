@@ -198,7 +198,7 @@ class FrameReader(Closing):
         if (magic, layout) != (_MAGIC, _LAYOUT):
             raise FrameError(f"{self.path} is no ring of layout {_LAYOUT}")
         if slot_bytes != _slot_bytes(*limits) or state.st_size != _WORD_BYTES * _HEAD_WORDS + slots * slot_bytes:
-            raise FrameError(f"{self.path} has {state.st_size} B, which does not fit what its head says")
+            raise FrameError(f"{self.path} has {state.st_size} B, which does not match its header")
         if found_epoch != epoch:
             return False
         self._mapping, self._epoch, self._slots, self._slot_bytes = mapping, epoch, slots, slot_bytes
