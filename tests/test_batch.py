@@ -78,7 +78,7 @@ def test_every_kind_of_drive_is_known_by_what_lies_there(tmp_path: Path) -> None
     ("arguments", "said"),
     [
         (["demo", "demo"], "demo: is named twice"),
-        (["s3://store/drive.mcap"], "say what it is, as in rosbag:s3://store/drive.mcap"),
+        (["s3://store/drive.mcap"], "unknown suffix; name the kind: rosbag:s3://store/drive.mcap"),
         (["list.txt"], "line 1: No closing quotation"),
     ],
 )

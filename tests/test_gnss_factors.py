@@ -312,7 +312,7 @@ def test_a_receiver_on_a_serial_line_is_heard(line: tuple[int, str]) -> None:
 def test_what_is_no_serial_line_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="can't be opened"):
         Receiver("/dev/no-such-line")
-    with pytest.raises(ConfigurationError, match="is no serial line"):
+    with pytest.raises(ConfigurationError, match="is not a serial line"):
         Receiver("/dev/null")
     with pytest.raises(ConfigurationError, match="no 12345 baud"):
         Receiver("/dev/null@12345")

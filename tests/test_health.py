@@ -307,7 +307,7 @@ def test_the_doctor_measures_what_settings_cost(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(doctor_costs, "PIECES", 3)
     rows = dict(doctor_costs.costs(1))
     assert all(rows.values())
-    assert "ms" in rows["every core wanted"]
+    assert "ms" in rows["all cores busy"]
     monkeypatch.setattr(os, "sched_setscheduler", refused)
     assert "not permitted" in dict(doctor_costs.costs(1))["the same, SCHED_FIFO"]
     with doctor_costs.busy_cores(1):

@@ -203,7 +203,7 @@ def test_nobody_notices_that_the_map_process_dies_stalls_and_has_a_full_disk(
     summary = run.summary()
     assert set(summary["restarts"].values()) == {0}
     assert summary["map"]["restarts"] == 2, out
-    assert "what was there stays: File too large" in out
+    assert "the old file is kept: File too large" in out
     assert "File too large" in summary["map"]["error"]
     assert path.read_bytes() == whole
     assert len(read_map(path)) >= 4

@@ -118,7 +118,7 @@ def test_a_file_of_version_2_has_no_lines(mapped: bytes) -> None:
 def test_lines_are_exported_in_metres_and_on_earth(mapped: bytes, tmp_path: Path) -> None:
     place_map = decode_map(mapped)
     said = export_map(place_map, tmp_path / "street.map.geojson")
-    assert said == "1 ways and 2 lines"
+    assert said == "1 trajectories and 2 lines"
     features = json.loads((tmp_path / "street.map.geojson").read_text())["features"]
     assert {each["properties"]["name"] for each in features} == {"drive 0", "dashed 3", "solid 4"}
     place_map.earth = Earth(51.0, 7.0, 0.0, 0.0, 0.0, 1.0, np.eye(4), 0.0, 40, 0, 1.0, None, 0.0)

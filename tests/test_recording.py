@@ -270,7 +270,7 @@ def test_what_the_disk_has_not_taken_is_not_counted_as_written(tmp_path: Path, m
 
 def test_recordings_are_never_overwritten(tmp_path: Path) -> None:
     (tmp_path / "a.mcap").touch()
-    for file, reason in (("a.mcap", "exists"), ("a.bag", "expected"), ("no/a.mcap", "there is no directory")):
+    for file, reason in (("a.mcap", "exists"), ("a.bag", "expected"), ("no/a.mcap", "no such directory")):
         with pytest.raises(ConfigurationError, match=reason):
             choose_file(RecordingConfig(file=str(tmp_path / file)), "car")
     chosen = Path(choose_file(RecordingConfig(file=str(tmp_path)), "car"))

@@ -242,7 +242,7 @@ def test_what_can_not_be_exported_is_named(tmp_path: Path, capsys: pytest.Captur
     for arguments, said in (
         ([drive, "--ros2", str(tmp_path / "there")], "there: is there already"),
         ([str(tmp_path / "none.mcap"), "--ros2", str(tmp_path / "x")], "none.mcap: can't be read"),
-        ([str(recording(tmp_path / "e.mcap", records=())), "--ros2", str(tmp_path / "x")], "holds no estimate"),
+        ([str(recording(tmp_path / "e.mcap", records=())), "--ros2", str(tmp_path / "x")], "has no estimate"),
         ([str(recording(tmp_path / "f.mcap", camera=None)), "--ros2", str(tmp_path / "x")], "has no camera"),
     ):
         assert main(["export", *arguments]) == 2

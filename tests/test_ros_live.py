@@ -502,7 +502,7 @@ def test_a_live_drive_comes_to_earth_by_the_fixes_that_came(tmp_path: Path) -> N
     for k in range(60):
         told = estimate(k, vehicles=0)
         drive.add(msgspec.structs.replace(told, t_source_ns=k * 10**8, T_world_ego=SE2(float(k), 0.0, 0.0)))
-    with pytest.raises(GnssError, match=r"gnss\.csv: no fix came"):
+    with pytest.raises(GnssError, match=r"gnss\.csv: no fix was received"):
         drive.finish(CAMERA, iter(()), tmp_path)
     east = 1.0 / 73_055.0  # degrees of longitude in a metre, at 49 degrees
     rows = [f"{0.1 * k:.9f},49.0,{8.4 + east * k:.9f},1.000" for k in range(60)]

@@ -228,7 +228,7 @@ def test_a_toy_camera_is_one_file_and_one_entry_too(
     assert len(list(open_source(configuration).frames())) == 3
     with pytest.raises(ConfigurationError, match="eye:me:secret@host: an odometry file is for recordings"):
         open_source(load(None, overrides | {"camera": str(tmp_path / "camera.toml"), "source.odometry": "x"}))
-    with pytest.raises(ConfigurationError, match="is a live camera, and a batch takes recordings"):
+    with pytest.raises(ConfigurationError, match="is a live camera; a batch needs recordings"):
         find_drives(["eye:host"])
     for door in (["evaluate", "odometry", "eye:host"], ["calibrate", "eye:host"]):
         assert main([*door, "--output", str(tmp_path / "out")]) == 2

@@ -1,5 +1,5 @@
-"""Many drives: each through the whole pipeline in one process, offline; results as for a run, one report of all.
+"""Processes many drives offline, each in one process, with results as for a run and one report of all.
 
-`drives` finds them, `offline` is the pipeline, `drive` takes one through it, `local` has many at once on this computer,
-`report` sums them up.
+`drives` finds them, `offline` is the pipeline, `drive` processes one, `local` runs many in parallel, `report`
+summarizes them.
 """

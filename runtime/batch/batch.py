@@ -1,4 +1,4 @@
-"""Many drives, each through the whole pipeline offline, and one report of all; goes on where it was stopped."""
+"""Processes many drives offline and writes one report; a stopped batch can be continued."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ from birdslam.runtime.batch.one_map import Joined, join
 from birdslam.runtime.batch.report import write_report
 from birdslam.runtime.progress import Progress
 
-THOUSANDTHS = 1000  # of a drive, that progress counts
+THOUSANDTHS = 1000  # progress units per drive
 
 
 @dataclass(frozen=True)
 class BatchOutcome:
-    """How many drives there were, and what became of them."""
+    """The number of drives and their outcome."""
 
     drives: int
     failed: int
-    interrupted: int  # not ended when Ctrl-C came
-    map: Joined | None = None  # of all drives, where one was asked for
+    interrupted: int  # unfinished at Ctrl-C
+    map: Joined | None = None  # of all drives, if requested
 
 
 def run_batch(
     todo: Sequence[Task], output: Path, jobs: int | None, ray_address: str | None, map_file: Path | None = None
 ) -> BatchOutcome:
-    """Runs those drives that are not done, and writes the report of all.
+    """Runs the drives without results, and writes the report of all.
 
-    `jobs`: drives at once, None: as many as fit; `ray_address`: of a Ray cluster, None: on this computer alone;
-    `map_file`: the drives' maps become one there, when all have ended. Raises ResultsError, MapError.
+    `jobs`: drives in parallel, None: as many as fit; `ray_address`: of a Ray cluster, None: this computer; `map_file`:
+    the joined map of all drives. Raises ResultsError, MapError.
     """
     with _exclusive(output):
         left = [task for task in todo if not done(output, task)]
@@ -57,19 +57,19 @@ def run_batch(
 
 @contextlib.contextmanager
 def _exclusive(output: Path) -> Iterator[None]:
-    """The only batch of this folder; what one that was killed left half done is removed."""
+    """Locks the folder for one batch; removes the partial results of a killed one."""
     claim_directory(output)
     with (output / ".lock").open("w") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
-            raise ResultsError(f"output directory {output}: another batch is at work in it") from None
+            raise ResultsError(f"output directory {output}: another batch is running in it") from None
         shutil.rmtree(output / WORKING, ignore_errors=True)
         yield
 
 
 def _run(left: list[Task], output: Path, events: Generator[Event]) -> tuple[int, int]:
-    """Runs the drives that are left; gives how many failed, and how many Ctrl-C left unfinished."""
+    """Runs the remaining drives; returns the number of failed ones and of those unfinished at Ctrl-C."""
     shares: dict[str, float] = {}
     failed = ended = 0
     with Progress("batch", len(left) * THOUSANDTHS, "drives", THOUSANDTHS) as progress:

@@ -1,7 +1,7 @@
-"""One drive from its first frame to its results, which appear at once: a folder that is renamed when it is whole.
+"""Processes one drive; its folder of results is renamed into place when it is complete.
 
-As a program (`python -m birdslam.runtime.batch.drive PARENT`) it takes a Job as JSON on standard input and writes
-"done total" after each frame; what went wrong is the last line of standard error, and exit status 1.
+As a program (`python -m birdslam.runtime.batch.drive PARENT`) it reads a Job as JSON from standard input and writes
+"done total" after each frame; on failure the last line of standard error is the reason, and the exit status 1.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 
 from birdslam.runtime.environment import ENVIRONMENT
 
-os.environ.update(ENVIRONMENT)  # before numpy: this is the first that a worker imports
+os.environ.update(ENVIRONMENT)  # before numpy is imported
 
 import msgspec
 import numpy as np
@@ -39,21 +39,21 @@ from birdslam.types import NS_PER_S, Estimate, MapUpdate, Measurements
 
 DRIVES, WORKING, FAILED = "drives", ".working", "failed"
 RESULT = "result.json"
-TOP_PERCENTILE = 95.0  # of the speeds: a single wrong step is no top speed
+TOP_PERCENTILE = 95.0  # of the speeds: robust to a single wrong step
 EXPECTED = (ConfigurationError, DatasetError, MapError, ModelError, ResultsError, SourceError, OSError)
 
-OnFrame = Callable[[int, int], object]  # called with the frames done, and of how many (0: unknown)
+OnFrame = Callable[[int, int], object]  # (frames done, total number of frames or 0)
 
 
 class Job(msgspec.Struct, frozen=True):
-    """A drive, and where its results go."""
+    """A drive and the folder of its results."""
 
     task: Task
     output: str
 
 
 class DriveResult(msgspec.Struct, frozen=True, kw_only=True):
-    """What the report says of a drive; it depends on the drive and its settings alone."""
+    """The entries of the report for a drive; deterministic for the drive and its settings."""
 
     drive: str
     source: str
@@ -68,21 +68,21 @@ class DriveResult(msgspec.Struct, frozen=True, kw_only=True):
     invalid_frames: int = 0
     epochs: int = 0
     statuses: dict[str, int] = {}
-    truth: OdometryReport | None = None  # None: the drive has none
+    truth: OdometryReport | None = None  # None: no ground truth
 
 
 class Failure(msgspec.Struct, frozen=True, kw_only=True):
-    """A drive without results, and why."""
+    """A failed drive and the reason."""
 
     drive: str
     source: str
     settings: dict[str, Any]
     error: str  # one line
-    details: str = ""  # the end of what it wrote
+    details: str = ""  # the end of its output
 
 
 def done(output: Path, task: Task) -> bool:
-    """Whether a drive has its results. Raises ConfigurationError where those in its place are of something else."""
+    """Whether a drive has its results. Raises ConfigurationError if the folder has results of something else."""
     file = output / DRIVES / task.name / RESULT
     if not file.exists():
         return False
@@ -92,21 +92,21 @@ def done(output: Path, task: Task) -> bool:
         raise ConfigurationError(f"{file}: is no result of a drive: {error}") from None
     if result.identity != task.identity:
         raise ConfigurationError(
-            f"{file.parent}: are the results of another drive, of other settings or of another version: give another "
-            "--output, or remove the folder"
+            f"{file.parent}: has results of another drive, other settings or another version; name another --output or "
+            "remove the folder"
         )
     return True
 
 
 def failure_file(output: Path, name: str) -> Path:
-    """The file that says why a drive failed."""
+    """Returns the path of a drive's failure report."""
     return output / FAILED / f"{name}.json"
 
 
 def run_drive(job: Job, on_frame: OnFrame) -> None:
-    """Takes a drive through the pipeline, and puts its results in place. Raises one of EXPECTED, and what is a bug."""
+    """Processes a drive and moves its results into place. Raises one of EXPECTED."""
     task, output = job.task, Path(job.output)
-    if done(output, task):  # by a worker that was thought lost
+    if done(output, task):  # by a worker that was considered lost
         return
     with local_copy(task.uri) as uri:
         _run(task, output, uri, on_frame)
@@ -131,7 +131,7 @@ def _run(task: Task, output: Path, uri: str, on_frame: OnFrame) -> None:
             motion, known = _Motion(frames, on_frame, drive_map), _known(recording, frames)
             (report,) = evaluate_recordings([recording], motion.watched(drive), working, compared=known)
         if drive_map is not None:
-            again = open_source(configuration)  # its frames again
+            again = open_source(configuration)
             assert isinstance(again, RecordedSource)
             drive_map.finish(recording.camera, one_map.frames(again.recording, frames), working / task.name)
         result = _result(task, working / task.name, motion, report)
@@ -148,7 +148,7 @@ def _run(task: Task, output: Path, uri: str, on_frame: OnFrame) -> None:
 
 
 def _known(recording: Recording, frames: int) -> slice:
-    """The frames from the first to the last with known truth; slice(None) where all have it."""
+    """Returns the frames from the first to the last with ground truth; slice(None) if all have it."""
     truth = recording.truth_poses()
     every = slice(None) if frames == len(recording) else slice(0, frames)
     if truth is None or np.isfinite(truth[:frames]).all():
@@ -158,7 +158,7 @@ def _known(recording: Recording, frames: int) -> slice:
 
 
 class _Motion:
-    """How long and how fast a drive is, by its estimates."""
+    """Duration and speeds of a drive, from its estimates."""
 
     def __init__(self, total: int, on_frame: OnFrame, drive_map: DriveMap | None) -> None:
         self._total, self._on_frame, self._map = total, on_frame, drive_map
@@ -168,7 +168,7 @@ class _Motion:
         self._before: Estimate | None = None
 
     def watched(self, drive: Drive) -> Drive:
-        """The same drive; its estimates are counted as they pass."""
+        """Wraps the drive to count its estimates."""
 
         def watched(recording: Recording) -> Iterator[Measurements | Estimate | MapUpdate]:
             for record in drive(recording):
@@ -215,12 +215,12 @@ def _result(task: Task, folder: Path, motion: _Motion, report: OdometryReport) -
 
 
 def main() -> int:
-    """The program; gives the exit status."""
+    """Runs the program; returns the exit status."""
     end_with_parent(int(sys.argv[1]))
     job = msgspec.json.decode(sys.stdin.buffer.read(), type=Job)
 
     def on_frame(frames: int, total: int) -> None:
-        with contextlib.suppress(BrokenPipeError):  # who started this is gone, and its end on the way
+        with contextlib.suppress(BrokenPipeError):  # the parent has ended, and this process is about to
             print(frames, total, flush=True)
 
     try:

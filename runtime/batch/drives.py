@@ -1,4 +1,4 @@
-"""The drives of a batch, of paths, URIs, URLs and lists of them; each has a name of its own, and its settings."""
+"""Finds the drives of a batch from paths, URIs, URLs and lists of them; assigns names and settings."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ LISTS = (".txt", ".list")
 
 
 class Found(msgspec.Struct, frozen=True):
-    """A drive, and what a list says of it alone."""
+    """A drive with its own settings from a list."""
 
     uri: str
     settings: dict[str, Any] = {}
 
 
 class Task(msgspec.Struct, frozen=True, kw_only=True):
-    """A drive with all its settings: what a worker needs."""
+    """A drive with all its settings, for a worker."""
 
     name: str  # of its folder of results
     uri: str
-    settings: dict[str, Any]  # of a sweep, and of the drive alone
+    settings: dict[str, Any]  # of the sweep and of the drive
     configuration: dict[str, Any]  # without the source's URI
-    identity: str  # of all that its results come from
+    identity: str  # hash of everything that determines its results
 
 
 def find_drives(arguments: Sequence[str]) -> list[Found]:
-    """The drives of a command line. Raises ConfigurationError for a list that can't be read, or where there is none."""
+    """Returns the drives of a command line. Raises ConfigurationError for an unreadable list, or without a drive."""
     found = [drive for argument in arguments for drive in _drives(argument)]
     twice = [drive for drive, count in Counter((d.uri, str(d.settings)) for d in found).items() if count > 1]
     if twice:
@@ -54,7 +54,7 @@ def find_drives(arguments: Sequence[str]) -> list[Found]:
 def _drives(argument: str, base: Path | None = None) -> Iterator[Found]:
     scheme, (_, colon, address) = scheme_of(argument, all_schemes()), argument.partition(":")
     if scheme is not None and scheme.live and colon:
-        raise ConfigurationError(f"{argument}: is a live camera, and a batch takes recordings")
+        raise ConfigurationError(f"{argument}: is a live camera; a batch needs recordings")
     if scheme is not None and (colon or argument in scheme.written):
         if scheme.address == "path" and address and not is_url(address):
             address = str(((base or Path()) / Path(address).expanduser()).absolute())
@@ -73,7 +73,7 @@ def _drives(argument: str, base: Path | None = None) -> Iterator[Found]:
         if inside:
             yield from map(Found, inside)
             return
-    yield Found(uri or f"{KITTI.name}:{path}")  # opening it says what is wrong
+    yield Found(uri or f"{KITTI.name}:{path}")  # opening it raises the error
 
 
 def _listed(path: Path) -> Iterator[Found]:
@@ -95,21 +95,23 @@ def _listed(path: Path) -> Iterator[Found]:
 
 
 def _uri(path: Path) -> str | None:
-    """The URI of the source at a path; None where there is none."""
+    """Returns the URI of the source at a path; None if there is none."""
     scheme = scheme_at(path, all_schemes())
     return None if scheme is None else f"{scheme.name}:{path}"
 
 
 def _uri_of_url(url: str) -> str:
-    """The URI of the source at a URL, by the file's name alone. Raises ConfigurationError where that is not enough."""
+    """Returns the URI of the source at a URL, by its file name. Raises ConfigurationError for an unknown suffix."""
     scheme = by_suffix(Path(url), all_schemes())
     if scheme is None:
-        raise ConfigurationError(f"{url}: say what it is, as in {ROSBAG.name}:{url} or {MCAP.name}:{url}")
+        raise ConfigurationError(
+            f"{url}: unknown kind of source; name it, as in {ROSBAG.name}:{url} or {MCAP.name}:{url}"
+        )
     return f"{scheme.name}:{url}"
 
 
 def sweep(texts: Sequence[str]) -> list[dict[str, Any]]:
-    """Every combination of the values of KEY=V1,V2 settings. Raises ConfigurationError."""
+    """Returns every combination of the values of KEY=V1,V2 settings. Raises ConfigurationError."""
     axes = []
     for text in texts:
         key, equals, values = text.partition("=")
@@ -123,9 +125,9 @@ def tasks(
     drives: Sequence[Found], settings: Sequence[Mapping[str, Any]], config: Path | None, overrides: Mapping[str, Any],
     models: Sequence[str], constants: Mapping[str, Any],
 ) -> list[Task]:  # fmt: skip
-    """Each drive by each of the settings, drives first; a setting may be a constant. Raises ConfigurationError.
+    """Combines each drive with each of the settings; a setting may be a constant. Raises ConfigurationError.
 
-    Drives of the same settings share one configuration, without the source's URI: there may be many.
+    Drives of the same settings share one configuration, without the source's URI, to save memory.
     """
     made: list[Task] = []
     known: dict[bytes, tuple[dict[str, Any], bytes]] = {}
@@ -158,7 +160,7 @@ def tasks(
 
 
 def _anchor(tree: dict[str, Any]) -> None:
-    """Makes paths absolute, by the folder in which the command was given: a worker may run in another one."""
+    """Makes paths absolute, since a worker may run in another folder."""
     if tree["source"]["speed"]:
         tree["source"]["speed"] = str(Path(tree["source"]["speed"]).expanduser().absolute())
     for spec in tree["models"].values():
@@ -168,7 +170,7 @@ def _anchor(tree: dict[str, Any]) -> None:
 
 
 def _names(drives: Sequence[Found]) -> list[str]:
-    """A name for each drive, that of its file or folder; of equal names each gets a part of its URI's hash."""
+    """Returns the name of each drive's file or folder; equal names get a part of the URI's hash."""
     plain = [Path(drive.uri.partition(":")[2] or drive.uri).stem for drive in drives]
     counts = Counter(plain)
     return [

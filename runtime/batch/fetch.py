@@ -1,4 +1,4 @@
-"""Drives that lie elsewhere: fetched by their URL to a folder of this computer, for as long as they are read."""
+"""Downloads drives from URLs to a temporary folder while they are read."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def is_url(address: str) -> bool:
 
 @contextlib.contextmanager
 def local_copy(uri: str) -> Iterator[str]:
-    """The URI of a drive as this computer can read it. Raises DatasetError where it can't be fetched."""
+    """Yields the URI of a local copy of a drive. Raises DatasetError if it can't be fetched."""
     scheme, _, address = uri.partition(":")
     if not is_url(address):
         yield uri
@@ -31,7 +31,7 @@ def local_copy(uri: str) -> Iterator[str]:
         try:
             storage, path = fsspec.core.url_to_fs(address)
             storage.get(path, str(place), recursive=bool(storage.isdir(path)))
-        except Exception as error:  # every storage has errors of its own
+        except Exception as error:  # each storage has its own exceptions
             reason = " ".join(str(error).split()) or type(error).__name__
             raise DatasetError(f"{uri}: can't be fetched: {reason}") from None
         yield f"{scheme}:{place}"

@@ -1,4 +1,4 @@
-"""Drives on this computer, several at once, each in a process of its own: a crash ends one drive alone."""
+"""Processes drives on this computer in parallel, each in its own process, so that a crash ends one drive only."""
 
 from __future__ import annotations
 
@@ -20,15 +20,14 @@ from birdslam.runtime.batch.drive import Failure, Job
 from birdslam.runtime.batch.drives import Task
 from birdslam.runtime.process.cores import usable_cores
 
-# Of one drive's process, with room for larger networks: with the shipped ones KITTI tracking 0005 takes 0.6 GB
-PROCESS_BYTES = 1_200_000_000
+PROCESS_BYTES = 1_200_000_000  # memory of one drive's process, with a margin for larger networks
 _PROGRESS = re.compile(rb"(\d+) (\d+)")
-DETAILS_BYTES = 4000  # of what a process wrote that are kept
+DETAILS_BYTES = 4000  # kept from the end of a process's output
 
 
 @dataclass(frozen=True)
 class Event:
-    """How far a drive has come, or its end; `failure` is None where it has its results."""
+    """The progress or the end of a drive; `failure` is None if it has its results."""
 
     task: Task
     share: float  # of its frames that are done
@@ -37,12 +36,12 @@ class Event:
 
 
 def fitting_jobs() -> int:
-    """How many drives at once: a core each, and memory for each."""
+    """Returns the number of drives in parallel that cores and memory allow."""
     return max(1, min(int(usable_cores()), int(psutil.virtual_memory().available // PROCESS_BYTES)))
 
 
 def run_local(tasks: Sequence[Task], output: Path, jobs: int) -> Generator[Event]:
-    """Runs them, `jobs` at once. Where the iteration is given up, their processes are ended."""
+    """Runs the tasks, `jobs` in parallel. Closing the iterator ends their processes."""
     waiting: queue.SimpleQueue[Task] = queue.SimpleQueue()
     for task in tasks:
         waiting.put(task)
@@ -73,7 +72,7 @@ class _Pool:
         self._stopped = False
 
     def work(self) -> None:
-        """A thread's: one drive after the other. It outlives its process, which would be ended with it."""
+        """Runs drives one after the other on a thread. A process ends with the thread that started it."""
         try:
             while True:
                 try:
@@ -84,7 +83,7 @@ class _Pool:
                 if self._stopped:
                     return
                 self.events.put(Event(task, 1.0, True, failure))
-        except BaseException as error:  # handed to who reads the events
+        except BaseException as error:  # raised by `run_local`
             self.events.put(error)
 
     def stop(self) -> None:
@@ -112,17 +111,17 @@ def run_job(
     started: Callable[[subprocess.Popen[bytes]], object] = lambda process: None,
     on_share: Callable[[float], object] = lambda share: None,
 ) -> Failure | None:
-    """Runs a drive in a process of its own, and waits for its end; None where its results are in place."""
+    """Runs a drive in its own process and waits for its end; returns None if it has its results."""
     task = job.task
     command = [sys.executable, "-m", "birdslam.runtime.batch.drive", str(os.getpid())]
-    with tempfile.TemporaryFile() as said:
-        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=said)
+    with tempfile.TemporaryFile() as output:
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=output)
         started(process)
         status = _attend(process, job, on_share)
         if status == 0:
             return None
-        said.seek(max(0, said.seek(0, os.SEEK_END) - DETAILS_BYTES))
-        details = said.read().decode(errors="replace").strip()
+        output.seek(max(0, output.seek(0, os.SEEK_END) - DETAILS_BYTES))
+        details = output.read().decode(errors="replace").strip()
     error = f"was killed by signal {-status}" if status < 0 else details.splitlines()[-1] if details else "failed"
     return Failure(drive=task.name, source=task.uri, settings=task.settings, error=error, details=details)
 
@@ -134,7 +133,7 @@ def _attend(process: subprocess.Popen[bytes], job: Job, on_share: Callable[[floa
         try:
             process.stdin.write(msgspec.json.encode(job))
             process.stdin.close()
-        except BrokenPipeError:  # it ended at once: its status says why
+        except BrokenPipeError:  # it ended at once
             return process.wait()
         for line in process.stdout:
             if match := _PROGRESS.fullmatch(line.strip()):

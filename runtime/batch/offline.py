@@ -1,4 +1,4 @@
-"""The whole method in this process, on frames as capture makes them, awaiting every network: it repeats bit for bit."""
+"""The whole pipeline in one process; waits for every network, so that results are reproducible bit for bit."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Drive = Callable[[Recording], Iterator[Measurements | Estimate | MapUpdate]]
 
 @contextlib.contextmanager
 def pipeline(configuration: Configuration) -> Iterator[Drive]:
-    """A function that drives a recording: each frame's Measurements, its Estimate, and what the map gained."""
+    """Yields a function that processes a recording and yields each frame's Measurements, Estimate and MapUpdate."""
     configuration = configuration.as_lossless()
     cv2.setNumThreads(configuration.perceive.opencv_threads)
     with contextlib.ExitStack() as stack:

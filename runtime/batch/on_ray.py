@@ -1,8 +1,7 @@
-"""Drives on a Ray cluster (the extra `ray`): a task a drive, its results written by the worker, as on one computer.
+"""Processes drives on a Ray cluster (the extra `ray`), one task per drive; the worker writes the results.
 
-The output folder lies on storage that every node shares, as do the drives, or these are fetched by their URL. A drive
-whose node is lost is taken up by another, RETRIES times; one that two workers thought theirs appears once. The driver
-holds what is in flight and no more, whatever the number of drives.
+The output folder must be on shared storage, and so must the drives unless they are URLs. A drive of a lost node is
+retried RETRIES times. Memory is bounded by the tasks in flight.
 """
 
 from __future__ import annotations
@@ -18,15 +17,15 @@ from birdslam.runtime.batch.local import Event, run_job
 from birdslam.runtime.configuration import ConfigurationError
 
 RETRIES = 3
-IN_FLIGHT_PER_CPU = 2  # tasks that Ray knows of: one at work, and one that waits beside it
+IN_FLIGHT_PER_CPU = 2  # submitted tasks: one running and one waiting
 
 
 def run_ray(tasks: Sequence[Task], output: Path, jobs: int | None, address: str) -> Generator[Event]:
-    """Runs them on the cluster at `address` ("auto": the one that this computer belongs to), `jobs` at once at most.
+    """Runs the tasks on the cluster at `address` ("auto": this computer's), at most `jobs` in parallel.
 
-    Raises ConfigurationError where there is no Ray, or no cluster. Where the iteration is given up, its tasks end.
+    Raises ConfigurationError without Ray or a cluster. Closing the iterator ends its tasks.
     """
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # it would tell its makers of every start
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # no telemetry
     try:
         import ray
     except ImportError:

@@ -1,4 +1,4 @@
-"""One map of many drives: each makes its own, on whatever computer it runs; those that share streets are joined."""
+"""Joins the maps of many drives that share streets."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ DRIVE_MAP = "drive.map"  # among a drive's results
 
 @dataclass(frozen=True)
 class Joined:
-    """What became of the drives' maps."""
+    """The outcome of joining the drives' maps."""
 
     keyframes: int
     size: int
     inside: tuple[str, ...]  # drives in the map
-    outside: tuple[str, ...]  # those that share no street with it
+    outside: tuple[str, ...]  # drives that share no street with it
 
 
 def listener(configuration: Configuration, folder: Path) -> DriveMap | None:
-    """Takes a drive's estimates and makes its map when it has ended; None where no map is asked for."""
+    """Returns a listener that builds the drive's map; None if no map is configured."""
     if not configuration.results.map:
         return None
     return DriveMap(MapChoice(folder / DRIVE_MAP, extend=True), None)
 
 
 def frames(recording: Recording, count: int) -> Frames:
-    """The first `count` frames, read from the beginning again."""
+    """Yields the first `count` frames of the recording."""
     for frame in recording.undistorted_frames():
         if frame.frame_id >= count:
             return
@@ -43,10 +43,10 @@ def frames(recording: Recording, count: int) -> Frames:
 
 
 def join(folders: Sequence[Path], path: Path) -> Joined | None:
-    """One map of those that these drives made, at `path`; begun from what is there. None: no drive made one.
+    """Joins the maps of these drives into the map at `path`, or into a new one; returns None if no drive has a map.
 
-    The longest begins it, and each pass takes in what shares a street with what is joined by then; every joint is one
-    optimisation of all. Raises MapError.
+    A new map starts with the longest; passes merge maps that share a street until none is left. Each merge optimizes
+    the whole map. Raises MapError.
     """
     maps = {folder.name: read_map(folder / DRIVE_MAP) for folder in folders if (folder / DRIVE_MAP).is_file()}
     waiting = sorted(maps, key=lambda name: (-len(maps[name]), name))

@@ -1,7 +1,6 @@
-"""The report of all drives: report.json, report.csv, and a page with a table and plots.
+"""Writes the report of all drives: report.json, report.csv, and a page with a table and plots.
 
-It is made of what lies in the output folder, drive by drive, so that it takes no memory of the drives' number but what
-is plotted: some numbers each.
+It reads the results drive by drive, so that only the plotted numbers are kept in memory.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from birdslam.runtime.batch.drives import Task
 
 MAX_BARS = 40  # of a plot; more drives are drawn as a histogram
 MAX_STATUSES = 12
-PLOTLY = "plotly.js"  # beside the report: the pages of all drives read it
+PLOTLY = "plotly.js"  # shared by the pages of all drives
 MAX_IN_A_CELL = 4  # statuses of one drive
 COLUMNS = (
     "drive", "source", "settings", "error", "frames", "duration_s", "path_m", "mean_speed_mps", "top_speed_mps",
@@ -34,11 +33,11 @@ COLUMNS = (
     "rpe_t_m", "rpe_r_deg",
 )  # fmt: skip
 PLOTS = (
-    ("path_m", "way (m)"),
+    ("path_m", "distance (m)"),
     ("mean_speed_mps", "mean speed (m/s)"),
     ("vehicles", "vehicles"),
-    ("invalid_frames", "frames that may not be driven by"),
-    ("ate_m", "ATE (m), where truth is there"),
+    ("invalid_frames", "invalid frames"),
+    ("ate_m", "ATE (m), with ground truth"),
 )
 STYLE = (
     ":root{color-scheme:light dark}body{font:15px sans-serif;margin:2em;background:Canvas}table{"
@@ -52,7 +51,7 @@ Outcome = DriveResult | Failure
 
 
 def outcomes(tasks: Sequence[Task], output: Path) -> Iterator[Outcome]:
-    """Of every drive that has ended, in order."""
+    """Yields the outcome of every finished drive, in order."""
     for task in tasks:
         result, failure = output / DRIVES / task.name / RESULT, failure_file(output, task.name)
         if result.is_file():
@@ -62,7 +61,7 @@ def outcomes(tasks: Sequence[Task], output: Path) -> Iterator[Outcome]:
 
 
 def row(outcome: Outcome) -> dict[str, Any]:
-    """One line of the report; what is not known is None."""
+    """Returns one row of the report; unknown values are None."""
     out: dict[str, Any] = dict.fromkeys(COLUMNS)
     truth = outcome.truth if isinstance(outcome, DriveResult) else None
     for part in (outcome, truth):
@@ -86,7 +85,7 @@ def write_report(tasks: Sequence[Task], output: Path) -> None:
 
 
 def _write_drives(tasks: Sequence[Task], output: Path) -> None:
-    """A page of each drive, where plotly is installed; they share its text, which lies beside them."""
+    """Writes a page for each drive if plotly is installed; all pages share its script."""
     if importlib.util.find_spec("plotly") is None:
         return
     _whole(output / PLOTLY, lambda file: file.write(plotly_script()))
@@ -98,7 +97,7 @@ def _write_drives(tasks: Sequence[Task], output: Path) -> None:
 
 
 def _whole(path: Path, write: Callable[[IO[str]], object]) -> None:
-    """Writes a file whole; whatever goes wrong, the old one stays."""
+    """Writes a file atomically; on failure the old file stays."""
     partial = path.with_name(f".{path.name}.partial")
     with partial.open("w", encoding="utf-8", newline="") as file:
         write(file)
@@ -126,7 +125,7 @@ def _cell(value: Any) -> Any:
 
 
 def _numbers(tasks: Sequence[Task], output: Path) -> tuple[list[str], np.ndarray, Counter[str]]:
-    """Names, (N, len(PLOTS)) with nan where nothing is known, and frames with each status."""
+    """Returns names, numbers (N, len(PLOTS)) with nan for unknown, and the number of frames with each status."""
     names, numbers, statuses = [], [], Counter[str]()
     for outcome in outcomes(tasks, output):
         if isinstance(outcome, DriveResult):
@@ -138,7 +137,7 @@ def _numbers(tasks: Sequence[Task], output: Path) -> tuple[list[str], np.ndarray
 
 
 def _plot(names: list[str], numbers: np.ndarray, statuses: Counter[str], path: Path) -> None:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # here, since it takes half a second to import
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # slow import
     from matplotlib.figure import Figure
 
     bars = len(names) <= MAX_BARS
@@ -205,17 +204,17 @@ def _write_page(file: IO[str], tasks: Sequence[Task], output: Path) -> None:
 
 
 def _write_sweep(file: IO[str], tasks: Sequence[Task], output: Path) -> None:
-    """Drives by settings: the ATE, or the way where no truth is there."""
+    """Writes a table of drives by settings: the ATE, or the distance without ground truth."""
     cells: dict[str, dict[str, str]] = {}
     heads: dict[str, None] = {}
     for outcome in outcomes(tasks, output):
         head = " ".join(f"{key}={value}" for key, value in outcome.settings.items())
         heads[head] = None
         found = row(outcome)
-        shown = f"{found['ate_m']:.3f} m ATE" if found["ate_m"] is not None else f"{_text(found['path_m'])} m way"
+        shown = f"{found['ate_m']:.3f} m ATE" if found["ate_m"] is not None else f"{_text(found['path_m'])} m"
         cells.setdefault(outcome.source, {})[head] = "failed" if isinstance(outcome, Failure) else shown
     file.write("<h2>By settings</h2>\n<table><tr><th>drive</th>")
-    file.write("".join(f"<th>{html.escape(head or 'as it is')}</th>" for head in heads) + "</tr>\n")
+    file.write("".join(f"<th>{html.escape(head or 'default')}</th>" for head in heads) + "</tr>\n")
     for source, own in cells.items():
         row_cells = "".join(f"<td>{own.get(head, '')}</td>" for head in heads)
         file.write(f"<tr><td>{html.escape(source)}</td>{row_cells}</tr>\n")

@@ -1,1 +1,1 @@
-"""`birdslam doctor`: whether this machine can keep what a vehicle needs, and what its settings cost."""
+"""`birdslam doctor`: checks whether this machine meets the needs of a vehicle, and measures its settings."""

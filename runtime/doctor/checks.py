@@ -1,8 +1,7 @@
-"""Checks of this machine for what a vehicle needs, with what to do where one fails (`birdslam doctor`).
+"""Checks whether this machine meets the needs of a vehicle, with advice for failures (`birdslam doctor`).
 
-A row for each thing: `ok`; `warning`, where the vehicle drives but may not keep its budgets; `error`, where it can't
-start.
-It looks with the rights of whoever calls it: as the service's user, `sudo -u birdslam birdslam doctor CONFIG`.
+Verdicts: `ok`; `warning`: it runs but may exceed its budgets; `error`: it can't start. The checks use the rights of
+the caller: for the service's user run `sudo -u birdslam birdslam doctor CONFIG`.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ RING_MARGIN = 2.0  # /dev/shm holds a second ring while a restarted capture repl
 
 @dataclass(frozen=True)
 class Finding:
-    """One row: what was looked at, how it is, and what to do where it is not well."""
+    """The result of one check, with advice if it failed."""
 
     what: str
     verdict: Verdict
@@ -48,7 +47,7 @@ class Finding:
 
 
 def examine(configuration: Configuration) -> Iterator[Finding]:
-    """All checks, one after the other; those of the source and the models only where they are configured."""
+    """Runs all checks; those of the source and the models only if they are configured."""
     checks: tuple[Callable[[Configuration], Iterator[Finding]], ...] = (
         *(_cores, _governor, _threads, _scheduling, _memory_lock, _memory, _runtime_dir, _shared_memory, _disk),
         *(_clock, _utc, _models, _source),
@@ -58,7 +57,7 @@ def examine(configuration: Configuration) -> Iterator[Finding]:
 
 
 def table(findings: list[Finding]) -> str:
-    """For a person."""
+    """Returns the findings as a printable table."""
     rows = [f"{f.verdict:8}{f.what:18}{f.found}{f'  ->  {f.advice}' if f.advice else ''}" for f in findings]
     return "\n".join(rows)
 
@@ -74,21 +73,21 @@ def _cores(configuration: Configuration) -> Iterator[Finding]:
         yield Finding("cores", "warning", f"{found}; {text} can't be used", "correct realtime.NODE.cpus")
     elif cores < MIN_CORES - 0.5:
         advice = (
-            f"33 frames a second want {MIN_CORES} cores: choose smaller networks or a lower rate, or raise CPUQuota="
+            f"33 frames per second need {MIN_CORES} cores: use smaller networks or a lower rate, or raise CPUQuota="
         )
         yield Finding("cores", "warning", found, advice)
     elif load > cores:
-        yield Finding("cores", "warning", found, "other programs want all of them: end them, or give them a nice value")
+        yield Finding("cores", "warning", found, "other programs use all of them: end them, or raise their nice value")
     else:
         yield Finding("cores", "ok", found)
 
 
 def _threads(configuration: Configuration) -> Iterator[Finding]:
-    """What runs side by side on a frame. BLAS and its like have one thread in every node (runtime/cli/main.py)."""
+    """Checks the threads that run in parallel on a frame; BLAS has one in every node (runtime/environment.py)."""
     cores = len(os.sched_getaffinity(0))
     networks: dict[str, int] = {}
     for role, spec in configuration.models.in_use().items():
-        with contextlib.suppress(ModelError):  # said with the models
+        with contextlib.suppress(ModelError):  # reported by `_models`
             networks[role] = load_network(role, spec, threads_of_a_network(usable_cores())).schedule.threads
     opencv = configuration.perceive.opencv_threads
     parts = [*(f"{role} {count}" for role, count in networks.items()), f"OpenCV {opencv}", "BLAS 1"]
@@ -103,7 +102,7 @@ def _governor(configuration: Configuration) -> Iterator[Finding]:
     files = sorted(Path("/sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor"))
     found = sorted({path.read_text().strip() for path in files})
     if not found:
-        yield Finding("governor", "ok", "the kernel offers none (a virtual machine sets its own speed)")
+        yield Finding("governor", "ok", "none in the kernel (a virtual machine has none)")
     elif found == ["performance"]:
         yield Finding("governor", "ok", "performance")
     else:
@@ -112,7 +111,7 @@ def _governor(configuration: Configuration) -> Iterator[Finding]:
 
 def _scheduling(configuration: Configuration) -> Iterator[Finding]:
     if configuration.realtime.fifo == "off":
-        yield Finding("SCHED_FIFO", "ok", "not asked for (realtime.fifo)")
+        yield Finding("SCHED_FIFO", "ok", "not configured (realtime.fifo)")
         return
     before, parameter = os.sched_getscheduler(0), os.sched_getparam(0)
     highest = max(configuration.realtime.of(node).priority for node in NODES)
@@ -128,7 +127,7 @@ def _scheduling(configuration: Configuration) -> Iterator[Finding]:
 
 def _memory_lock(configuration: Configuration) -> Iterator[Finding]:
     if configuration.realtime.lock_memory == "off":
-        yield Finding("memory lock", "ok", "not asked for (realtime.lock_memory)")
+        yield Finding("memory lock", "ok", "not configured (realtime.lock_memory)")
     elif realtime.may_lock_memory():
         yield Finding("memory lock", "ok", "permitted")
     else:
@@ -141,7 +140,7 @@ def _memory(configuration: Configuration) -> Iterator[Finding]:
     free_gib = int(lines["MemAvailable"].split()[0]) / 2**20
     enough = free_gib >= MIN_MEMORY_GIB
     advice = (
-        "" if enough else f"the nodes and their spares want {MIN_MEMORY_GIB:g} GiB: runtime.spares=false halves that"
+        "" if enough else f"the nodes and their spares need {MIN_MEMORY_GIB:g} GiB; runtime.spares=false halves that"
     )
     yield Finding("memory", "ok" if enough else "warning", f"{free_gib:.1f} GiB available", advice)
 
@@ -159,7 +158,7 @@ def _shared_memory(configuration: Configuration) -> Iterator[Finding]:
     try:
         place = ring_path(configuration.vehicle, configuration.runtime_dir).parent
     except (OSError, ValueError):
-        return  # said already
+        return  # reported by `_runtime_dir`
     camera = configuration.camera
     pixels = 1920 * 1080 if camera is None else camera.width_px * camera.height_px
     needed, free = RING_MARGIN * pixels * 3 * configuration.runtime.ring_slots, shutil.disk_usage(place).free
@@ -167,7 +166,7 @@ def _shared_memory(configuration: Configuration) -> Iterator[Finding]:
     if free < needed:
         yield Finding("shared memory", "error", found, f"mount -o remount,size={needed / 2**20:.0f}M {place}")
     elif str(place) != "/dev/shm":
-        yield Finding("shared memory", "warning", found, "/dev/shm is not writable: frames go over a file system")
+        yield Finding("shared memory", "warning", found, "/dev/shm is not writable: frames are stored in a file system")
     else:
         yield Finding("shared memory", "ok", found)
 
@@ -178,7 +177,7 @@ def _disk(configuration: Configuration) -> Iterator[Finding]:
         place = place.parent
     free_gib = shutil.disk_usage(place).free / 2**30
     if not os.access(place, os.W_OK):
-        yield Finding("output", "error", f"{place} can't be written", "choose another --output")
+        yield Finding("output", "error", f"{place} is not writable", "name another --output")
     elif free_gib < 1.0:
         yield Finding("output", "warning", f"{place}: {free_gib:.1f} GiB free", "an hour of results is about 0.1 GiB")
     else:
@@ -193,37 +192,37 @@ def _clock(configuration: Configuration) -> Iterator[Finding]:
         return
     late_ms = max(_lateness_ms() for _ in range(20))
     verdict: Verdict = "ok" if late_ms < 5.0 else "warning"
-    advice = "" if verdict == "ok" else "the machine is busy, or sleeps too deep (cpupower idle-set -D 10)"
+    advice = "" if verdict == "ok" else "the machine is busy, or its idle states are too deep (cpupower idle-set -D 10)"
     yield Finding("clock", verdict, f"{name}, a sleep of 5 ms is late by up to {late_ms:.1f} ms", advice)
 
 
 def _utc(configuration: Configuration) -> Iterator[Finding]:
-    """Ages need no UTC; planners on another machine do."""
-    advice = "start a time service (chrony, systemd-timesyncd): planners on other machines go by t_utc_ns"
+    """Checks UTC, which planners on other machines need."""
+    advice = "start a time service (chrony, systemd-timesyncd): planners on other machines use t_utc_ns"
     if time.time() < 1.6e9:
         yield Finding("UTC", "warning", "the date is before 2020", advice)
     elif not _synchronised():
-        yield Finding("UTC", "warning", "no time service keeps it", advice)
+        yield Finding("UTC", "warning", "not synchronized by a time service", advice)
     else:
-        yield Finding("UTC", "ok", "kept by a time service")
+        yield Finding("UTC", "ok", "synchronized by a time service")
 
 
 def _synchronised() -> bool:
-    """Whether a time daemon disciplines the clock: adjtimex(2) gives TIME_ERROR where none does."""
-    libc, timex = ctypes.CDLL(None), ctypes.create_string_buffer(_TIMEX_BYTES)  # all zero: it only asks
+    """Whether a time daemon synchronizes the clock; otherwise adjtimex(2) returns TIME_ERROR."""
+    libc, timex = ctypes.CDLL(None), ctypes.create_string_buffer(_TIMEX_BYTES)  # zeros: read only
     return 0 <= libc.adjtimex(timex) < _TIME_ERROR
 
 
 def _lateness_ms() -> float:
-    begun_s = time.monotonic()
+    start_s = time.monotonic()
     time.sleep(0.005)
-    return (time.monotonic() - begun_s - 0.005) * 1e3
+    return (time.monotonic() - start_s - 0.005) * 1e3
 
 
 def _models(configuration: Configuration) -> Iterator[Finding]:
     specs = configuration.models.in_use()
     if not specs:
-        yield Finding("models", "warning", "none", "without --model none the shipped network runs; now odometry only")
+        yield Finding("models", "warning", "none: odometry only", "omit --model none to run the shipped network")
     from birdslam.perception.session import providers_here
 
     here = ", ".join(providers_here())
@@ -233,11 +232,11 @@ def _models(configuration: Configuration) -> Iterator[Finding]:
             network = load_network(role, msgspec.structs.replace(spec, provider=asked))
             described = network.describe()
         except ModelError as error:
-            yield Finding(role, "error", str(error), "give the network that its manifest describes")
+            yield Finding(role, "error", str(error), "use the network that its manifest describes")
         else:
             found = f"{described['file']}, sha256 {described['sha256'][:12]}, by {asked} of {here}"
             if network.fell_back:
-                advice = 'install the package that brings it (docs/networks.md), or perceive.provider = "auto"'
+                advice = 'install its package (docs/networks.md), or set perceive.provider = "auto"'
                 yield Finding(role, "warning", f"{found}: {network.fell_back}", advice)
             else:
                 yield Finding(role, "ok", found)
@@ -260,4 +259,4 @@ def _source(configuration: Configuration) -> Iterator[Finding]:
     size = "unreadable" if first.image is None else f"{first.image.shape[1]}x{first.image.shape[0]} px"
     verdict: Verdict = "error" if first.image is None else "ok"
     found = f"{source.name}: {size}, {source.rate_hz:g} Hz"
-    yield Finding("camera", verdict, found, "" if first.image is not None else f"{first.error}: look at the cable")
+    yield Finding("camera", verdict, found, "" if first.image is not None else f"{first.error}: check the cable")

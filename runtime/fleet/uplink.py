@@ -22,7 +22,7 @@ import zenoh
 from birdslam.runtime.configuration import Configuration, ConfigurationError, FleetConfig
 from birdslam.runtime.fleet.link import check, open_link
 from birdslam.runtime.process import signals
-from birdslam.runtime.process.notify import LOOK_S
+from birdslam.runtime.process.notify import STATUS_S
 from birdslam.runtime.process.sender import RateLimit, send
 from birdslam.runtime.topology import PROCESSES, QUERIES, TOPICS, alive_key, key_of
 from birdslam.runtime.transport.bus import Bus, BusClosed, BusError, Publisher, Subscriber
@@ -43,7 +43,7 @@ class Uplink(Closing):
     A context manager. Raises as Bus does.
     """
 
-    pause_s = LOOK_S
+    pause_s = STATUS_S
 
     def __init__(
         self, vehicle: str, config: FleetConfig, session: zenoh.Session, runtime_dir: Path | None = None

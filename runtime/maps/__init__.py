@@ -1,1 +1,1 @@
-"""Maps that are kept: their files, and what a drive makes of one when it is over."""
+"""Persistent maps: their files, and localisation and mapping of a drive, during it or afterwards."""

@@ -1,4 +1,4 @@
-"""A drive on Earth, and its map: fixes and estimates in one graph, when the drive is over."""
+"""Georeferences a drive and its map after the drive: GNSS fixes and estimates in one graph."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from birdslam.types import Estimate
 
 
 def places_of(estimates: list[Estimate]) -> list[Place]:
-    """Those of the longest epoch: between epochs the way is unknown. Their world is the map."""
+    """Returns the poses of the longest epoch; its world frame is the map frame."""
     if not estimates:
         return []
     longest = Counter(estimate.epoch for estimate in estimates).most_common(1)[0][0]
@@ -46,9 +46,9 @@ def write_earth(
     output: Path,
     place_map: PlaceMap | None,
 ) -> tuple[dict[str, Any], list[Place]]:
-    """Writes ego.geojson, ego.gpx and ego.kml, and brings the map to Earth; what summary.json says, and the places.
+    """Writes ego.geojson, ego.gpx and ego.kml, and georeferences the map.
 
-    Raises GnssError, EarthError, OSError.
+    Returns the entries of summary.json and the places. Raises GnssError, EarthError, OSError.
     """
     if not places:
         raise EarthError("the drive has no pose")
@@ -78,7 +78,7 @@ def write_earth(
 
 
 def _nodes(way: Sequence[SE2]) -> tuple[list[Node], list[Link]]:
-    """Of a drive without a map: one every few metres, joined by odometry."""
+    """Returns the nodes of a drive without a map, one every few metres, linked by odometry."""
     nodes, links = [Node(0, way[0])], []
     for pose in way:
         step = nodes[-1].T_map_keyframe.between(pose)
@@ -89,7 +89,7 @@ def _nodes(way: Sequence[SE2]) -> tuple[list[Node], list[Link]]:
 
 
 def _bent(way: Sequence[SE2], nodes: Sequence[Placed], found: OnEarth) -> list[SE2]:
-    """The drive's way as its nearest keyframes lie now."""
+    """Moves each pose of the trajectory with its nearest keyframe."""
     before = [node.T_map_keyframe for node in nodes]
     moves = [found.poses[node.number][0] @ T.inverse() for node, T in zip(nodes, before, strict=True)]
     tree = cKDTree(np.array([(T.x_m, T.y_m) for T in before]))
@@ -98,7 +98,7 @@ def _bent(way: Sequence[SE2], nodes: Sequence[Placed], found: OnEarth) -> list[S
 
 
 def figures(earth: Earth, camera: Camera) -> dict[str, Any]:
-    """For summary.json and the properties of the files."""
+    """Returns the entries of summary.json, which are also the properties of the files."""
     sigma_m = float(np.sqrt(np.diag(earth.cov)[:2].max()))
     return {
         "latitude_deg": round(earth.latitude_deg, 8),
@@ -118,12 +118,12 @@ def figures(earth: Earth, camera: Camera) -> dict[str, Any]:
 
 
 def rows(found: dict[str, Any]) -> list[tuple[str, str]]:
-    """The lines of a run's table that speak of Earth."""
+    """Returns the rows of a run's summary table about GNSS."""
     fit = f"{found['fixes']} fixes, {found['outliers']} outliers, rms {found['rms_m']:.2f} m: ego.geojson, .gpx, .kml"
-    out = [("on Earth", fit)]
-    ratio = "" if found["speed_ratio"] is None else f", speed over theirs {found['speed_ratio']:.3f}"
+    out = [("GNSS", fit)]
+    ratio = "" if found["speed_ratio"] is None else f", speed ratio {found['speed_ratio']:.3f}"
     sigma = 100.0 * found["sigma_scale"]
-    out.append(("  metres", f"GNSS over ours {found['scale_to_gnss']:.3f} +- {sigma:.1f} %{ratio}"))
+    out.append(("  scale", f"GNSS / odometry {found['scale_to_gnss']:.3f} +- {sigma:.1f} %{ratio}"))
     if found["hint"]:
         out.append(("  hint", found["hint"]))
     return out

@@ -1,6 +1,6 @@
-"""A drive and a map, when the drive is over: one pass over the recording's frames and the estimates of each.
+"""Localisation and mapping after a drive: one pass over the recording's frames and estimates.
 
-It costs the drive nothing but the memory of its estimates, and the same estimates give the same map.
+During the drive only the estimates are stored; the same estimates give the same map.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ Frames = Iterator[tuple[int, int, NDArray[np.uint8] | None]]
 
 
 def check_map_choice(configuration: Configuration, camera: Camera) -> None:
-    """Raises MapError, GnssError or ConfigurationError for what the drive could not use."""
+    """Raises MapError, GnssError or ConfigurationError for an unusable map or GNSS input."""
     choice, gnss = MapChoice.of(configuration), configuration.results.gnss
     if choice is not None:
         choice.open(camera)
     if gnss and is_serial(gnss):
         if not configuration.maps_live:
-            raise ConfigurationError("results.gnss: a receiver is heard by the map process: a live drive with --map")
+            raise ConfigurationError("results.gnss: a receiver needs a live drive with --map")
         Receiver(gnss).close()
     else:
         recorded_fixes(configuration)
 
 
 class DriveMap:
-    """Listens to the drive (`add`), and makes the map of it, or its place on Earth, or both (`finish`)."""
+    """Collects estimates (`add`) and then builds the map, georeferences the drive, or both (`finish`)."""
 
     def __init__(self, choice: MapChoice | None, gnss: Fixes | None) -> None:
         self._choice, self._gnss = choice, gnss
@@ -47,7 +47,7 @@ class DriveMap:
 
     @staticmethod
     def of(configuration: Configuration) -> DriveMap | None:
-        """What the configuration asks for and no process does meanwhile; None: nothing.
+        """Returns what the configuration requests after the drive; None if nothing, or if the map process does it.
 
         Raises ConfigurationError, GnssError.
         """
@@ -57,15 +57,15 @@ class DriveMap:
         return None if choice is None and gnss is None else DriveMap(choice, gnss)
 
     def add(self, estimate: Estimate) -> None:
-        """Keeps what the map needs of it."""
+        """Stores an estimate without its vehicles."""
         if Status.END_OF_SOURCE not in estimate.status:
             self._estimates.append(msgspec.structs.replace(estimate, vehicles=()))
 
     def add_map(self, update: MapUpdate) -> None:
-        """Lanes and landmarks are not in the map of places."""
+        """Does nothing: the map has no landmarks of the graph."""
 
     def finish(self, camera: Camera, frames: Frames, output: Path) -> dict[str, Any]:
-        """Writes what was asked for; what summary.json says: "map", "earth".
+        """Writes the requested results; returns "map" and "earth" of summary.json.
 
         Raises MapError, GnssError, EarthError, OSError or ConfigurationError.
         """
@@ -87,7 +87,7 @@ class DriveMap:
         return summary
 
     def _localise(self, drive: MapDrive, frames: Frames) -> None:
-        """The pass over the frames."""
+        """Processes all frames."""
         waiting = iter(frames)
         frame_id, image = -1, None
         with Progress("map", len(self._estimates)) as progress:

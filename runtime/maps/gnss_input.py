@@ -1,8 +1,7 @@
-"""Where fixes of a drive come from: a file, a topic of ROS, or a receiver on a serial line.
+"""Sources of GNSS fixes: a file, a ROS topic, or a receiver on a serial line.
 
-`FILE` (CSV, NMEA, GPX; see birdslam/loops/gnss/files.py), `topic:/NAME` (sensor_msgs/NavSatFix) of the drive's own bag,
-or of a live ROS 2 those that came while the car drove, `/dev/TTY[@BAUD]` (NMEA 0183). A serial line's fixes bear the
-time at which they came in; that this is late is found out with the rest.
+`FILE` (CSV, NMEA, GPX; see birdslam/loops/gnss/files.py), `topic:/NAME` (sensor_msgs/NavSatFix) of the drive's bag or
+of live ROS 2, `/dev/TTY[@BAUD]` (NMEA 0183). Fixes of a serial line have their time of arrival; the delay is estimated.
 """
 
 from __future__ import annotations
@@ -28,17 +27,17 @@ from birdslam.sources.rosbag import RosbagRecording
 from birdslam.sources.schemes import scheme_of
 
 TOPIC, BAG, NAV_SAT_FIX = "topic:", "rosbag", "sensor_msgs/NavSatFix"
-BAUD = 9600  # as NMEA 0183 receivers come
-MAX_LINE_BYTES = 512  # NMEA's own limit is 82
+BAUD = 9600  # default of NMEA 0183 receivers
+MAX_LINE_BYTES = 512  # the limit of NMEA is 82
 REOPEN_S = 1.0
 
 log = logging.getLogger(__name__)
 
-Fixes = Callable[[int], Track]  # of the recording's first time in ns; raises GnssError
+Fixes = Callable[[int], Track]  # argument: first time of the recording in ns; raises GnssError
 
 
 def is_serial(name: str) -> bool:
-    """Whether it is a device, and not a file."""
+    """Whether the name is a device, not a file."""
     try:
         return stat.S_ISCHR(os.stat(name.partition("@")[0]).st_mode)
     except OSError:
@@ -46,12 +45,12 @@ def is_serial(name: str) -> bool:
 
 
 def recorded_fixes(configuration: Configuration) -> Fixes | None:
-    """Those of a file or a bag; None: a receiver's, or none are asked for. Raises ConfigurationError, GnssError."""
+    """Returns the fixes of a file or a bag; None for a receiver or no GNSS. Raises ConfigurationError, GnssError."""
     name = configuration.results.gnss
     if not name or is_serial(name):
         return None
     if name.startswith(TOPIC) and scheme_of(configuration.source.uri, all_schemes()) is ROS:
-        return lambda begin_ns: _that_came(Path(configuration.output) / GNSS_FILE, begin_ns)
+        return lambda begin_ns: _written_live(Path(configuration.output) / GNSS_FILE, begin_ns)
     if name.startswith(TOPIC):
         found = _of_bag(configuration, name.removeprefix(TOPIC))
         return lambda begin_ns: Track(found)
@@ -62,22 +61,22 @@ def recorded_fixes(configuration: Configuration) -> Fixes | None:
     except OSError as error:
         raise GnssError(f"{path}: can't be read: {error.strerror}") from None
     offset_s = configuration.results.gnss_offset_s
-    read_track(data, str(path), 0, offset_s)  # what is wrong with it is said before the drive
+    read_track(data, str(path), 0, offset_s)  # raises errors before the drive
     return lambda begin_ns: read_track(data, str(path), begin_ns, offset_s)
 
 
-def _that_came(path: Path, begin_ns: int) -> Track:
-    """What the source wrote while the car drove (runtime/ros/camera.py)."""
+def _written_live(path: Path, begin_ns: int) -> Track:
+    """Returns the fixes that the source wrote during the drive (runtime/ros/camera.py)."""
     if not path.is_file():
-        raise GnssError(f"{path}: no fix came")
+        raise GnssError(f"{path}: no fix was received")
     return read_track(path.read_bytes(), str(path), begin_ns)
 
 
 def _of_bag(configuration: Configuration, topic: str) -> list[GnssFix]:
-    """Fixes with the covariance that they tell; a status below zero is no fix."""
+    """Returns the fixes with their reported covariance; a status below zero is no fix."""
     scheme, _, path = configuration.source.uri.partition(":")
     if scheme != BAG:
-        raise ConfigurationError(f"results.gnss: {TOPIC}{topic}: the source is no ROS bag")
+        raise ConfigurationError(f"results.gnss: {TOPIC}{topic}: the source is not a ROS bag")
     try:
         messages = RosbagRecording(Path(path), configuration.camera, topics=configuration.source.topics).timed(
             topic, NAV_SAT_FIX
@@ -98,19 +97,19 @@ def _of_bag(configuration: Configuration, topic: str) -> list[GnssFix]:
 
 
 class Receiver:
-    """A receiver on a serial line, read in a thread of its own: `take` gives the fixes since the last call.
+    """A receiver on a serial line, read in a thread: `take` returns the fixes since the last call.
 
-    One that is unplugged is looked for again; its lines are untrusted, and what is none is passed over.
+    Reconnects after it was unplugged. Its lines are untrusted; invalid ones are skipped and counted.
     """
 
     def __init__(self, name: str) -> None:
-        """Raises ConfigurationError where the line can't be opened."""
+        """Raises ConfigurationError if the line can't be opened."""
         self._path, _, baud = name.partition("@")
         speed = getattr(termios, f"B{baud or BAUD}", None)
         if speed is None:
             raise ConfigurationError(f"results.gnss: {name}: a serial line has no {baud} baud")
         self._speed: int = speed
-        self.refused = 0  # lines that were none
+        self.refused = 0  # invalid lines
         self._fixes: list[tuple[int, Sentence]] = []
         self._lock = threading.Lock()
         self._stop = os.eventfd(0)
@@ -130,7 +129,7 @@ class Receiver:
             termios.tcsetattr(fd, termios.TCSANOW, mode)
         except termios.error as error:
             os.close(fd)
-            raise OSError(error.args[0], f"is no serial line: {error.args[1]}") from None
+            raise OSError(error.args[0], f"is not a serial line: {error.args[1]}") from None
         return fd
 
     def _run(self, fd: int | None) -> None:
@@ -142,13 +141,13 @@ class Receiver:
                     return
                 os.close(fd)
             except OSError:
-                log.debug("%s is gone", self._path)  # looked for again each second
+                log.debug("%s is disconnected", self._path)
             fd = None
 
     def _listen(self, fd: int) -> bool:
-        """Until it is unplugged; True where it is to stop."""
+        """Reads until the receiver is unplugged; returns True after `close`."""
         reader, rest = NmeaReader(), b""
-        arrived_ns = 0  # of the line that began the fix at hand
+        arrived_ns = 0  # arrival of the first line of the current fix
         while True:
             ready = select.select([fd, self._stop], [], [])[0]
             if self._stop in ready:
@@ -161,7 +160,7 @@ class Receiver:
             except OSError:
                 data = b""
             if not data:
-                log.warning("%s: the GNSS receiver is gone", self._path)
+                log.warning("%s: the GNSS receiver is disconnected", self._path)
                 return False
             *lines, rest = (rest + data).split(b"\n")
             rest = rest[-MAX_LINE_BYTES:]
@@ -182,7 +181,7 @@ class Receiver:
         return now_ns if reader.waits != started else arrived_ns
 
     def take(self, offset_ns: int) -> list[GnssFix]:
-        """New fixes; `offset_ns`: of the recording's clock from CLOCK_MONOTONIC."""
+        """Returns new fixes; `offset_ns`: the recording's clock less CLOCK_MONOTONIC."""
         with self._lock:
             found, self._fixes = self._fixes, []
         out = []

@@ -12,24 +12,21 @@ from birdslam.loops.place_map import PlaceMap
 from birdslam.outputs.placed import Place
 from birdslam.types import Estimate
 
-POSE_EVERY_M = 1.0  # of way: what is kept of a drive for its place on Earth
-MAX_POSES = 20_000  # of them; a longer drive keeps every second one, and so on
-HELD_M = 30.0  # a pose moves with the keyframe that is so near
-NONE = -1  # in place of a keyframe's number: there was none near, and the pose is in the map
+POSE_EVERY_M = 1.0  # initial spacing of the stored poses
+MAX_POSES = 20_000  # at this number every second pose is removed and the spacing is doubled
+HELD_M = 30.0  # max. distance of a pose from its keyframe
+NONE = -1  # number in place of a keyframe's, for a pose relative to the map
 
 
-class HeldWay:
-    """`add` takes each pose in the map; `places` returns the kept ones.
-
-    Two arrays of fixed size hold them, so that the map process does not grow during a drive.
-    """
+class HeldTrajectory:
+    """`add` takes each pose in the map; `places` returns the stored ones, from arrays of fixed size."""
 
     def __init__(self) -> None:
         self._numbers = np.full((MAX_POSES + 1, 3), NONE, np.int64)  # source time in ns, epoch, keyframe
         self._poses = np.full((MAX_POSES + 1, 6), np.nan)  # T_odom_ego and T_keyframe_ego: x_m, y_m, yaw_rad
         self._length = 0
         self._every_m = POSE_EVERY_M
-        self._last: SE2 | None = None  # of them, in the map
+        self._last: SE2 | None = None  # stored pose, in the map
 
     def add(self, estimate: Estimate, T_map_ego: SE2, place_map: PlaceMap) -> None:
         """Adds a pose if its distance from the last kept one exceeds the spacing."""

@@ -1,6 +1,6 @@
-"""One drive and its map, frame by frame: `map.tum.txt` and `localisation.csv` as it goes, and the map at its end.
+"""Localisation and mapping of a drive frame by frame: writes `map.tum.txt`, `localisation.csv` and the map.
 
-The same for a drive that is over (drive_map.py) and for one that goes on (map_process.py).
+Used after a drive (drive_map.py) and during it (map_process.py).
 """
 
 from __future__ import annotations
@@ -21,67 +21,66 @@ from birdslam.loops.session import MapSession
 from birdslam.outputs.map_trajectory import MapTrajectory, TrajectoryFiles
 from birdslam.outputs.placed import Place
 from birdslam.runtime.configuration import Configuration, ConfigurationError
-from birdslam.runtime.maps.held_way import HeldWay
+from birdslam.runtime.maps.held_way import HeldTrajectory
 from birdslam.runtime.maps.map_store import check_map, write_map
 from birdslam.types import NS_PER_S, Estimate
 
 
 @dataclass(frozen=True)
 class MapChoice:
-    """Which map, and whether the drive may write it."""
+    """The map file, and whether the drive extends it."""
 
     path: Path
     extend: bool
 
     @staticmethod
     def of(configuration: Configuration) -> MapChoice | None:
-        """What the configuration asks for; None: no map. Raises ConfigurationError."""
+        """Returns the configured map; None without one. Raises ConfigurationError."""
         results = configuration.results
         if results.map and results.map_only:
-            raise ConfigurationError("results.map, results.map_only: a map is written, or only read; name one of them")
+            raise ConfigurationError("results.map, results.map_only: name only one of them")
         if results.map or results.map_only:
             return MapChoice(Path(results.map or results.map_only).expanduser(), bool(results.map))
         return None
 
     def open(self, camera: Camera) -> PlaceMap:
-        """The map that the drive begins with. Raises MapError, or ConfigurationError for one of another camera."""
+        """Returns the initial map of the drive. Raises MapError, or ConfigurationError for one of another camera."""
         found = check_map(self.path, self.extend)
         if found is None:
             return PlaceMap(MapCamera.of(camera))
         other = found.camera.differs(camera)
         if other and self.extend:
             raise ConfigurationError(
-                f"{self.path}: is the map of another camera: {other}; localise in it by --map-only, "
-                "or begin another map"
+                f"{self.path}: is the map of another camera: {other}; localise in it by --map-only, or name a new map"
             )
         return found
 
 
 class MapDrive:
-    """`step` takes each frame, `finish` ends the drive; `save` writes the map as it is meanwhile."""
+    """`step` processes a frame, `end` ends the drive, `save` writes the current map."""
 
     def __init__(self, choice: MapChoice, camera: Camera, output: Path) -> None:
         """Raises MapError, ConfigurationError, OSError."""
         self.map = choice.open(camera)
-        self._way = HeldWay()
+        self._held = HeldTrajectory()
         self._choice = choice
         self._before = self._saved = len(self.map)
         self._session = MapSession(camera, self.map, choice.extend)
         self._trajectory, self._files = MapTrajectory(), TrajectoryFiles(output)
         self._begin_ns: int | None = None
         self._frame_id = -1
-        self.unwritten: OSError | None = None  # the disk is full: the drive's files end here, the map goes on
+        self.unwritten: OSError | None = None  # the disk error that ended the drive's files
 
     def resume(self, pose: MapPose) -> None:
-        """Goes on where the process before this one had come to."""
+        """Continues from the last pose of the previous process."""
         self._session.resume(pose)
 
     def due(self, estimate: Estimate) -> bool:
-        """Whether the image of the next frame is looked at."""
+        """Whether the image of the next frame is processed."""
         return self._session.due(estimate)
 
     def step(self, estimate: Estimate, image: NDArray[np.uint8] | None) -> Localisation:
-        """One frame, undistorted; None: it is not looked at. One that comes again, corrected, has its row already."""
+        """Processes a frame; `image` is undistorted, None: not processed. A frame published again adds no row."""
         if self._begin_ns is None:
             self._begin_ns = estimate.t_source_ns
         found = self._session.step(estimate, image)
@@ -89,13 +88,13 @@ class MapDrive:
             self._write(self._trajectory.add(found, estimate))
         self._frame_id = estimate.frame_id
         if found.T_map_ego is not None and estimate.valid:
-            self._way.add(estimate, found.T_map_ego, self.map)
+            self._held.add(estimate, found.T_map_ego, self.map)
         return found
 
     @property
     def places(self) -> list[Place]:
-        """The drive's way, every metre or so, as the map's keyframes lie now."""
-        return self._way.places(self.map)
+        """The drive's trajectory, about one pose per metre, for the current poses of the map's keyframes."""
+        return self._held.places(self.map)
 
     def _write(self, settled: list[Localisation]) -> None:
         if self.unwritten is None:
@@ -106,20 +105,20 @@ class MapDrive:
 
     @property
     def T_map_odom(self) -> SE2 | None:
-        """Joins the two frames (REP-105); None where lost."""
+        """The transform between the frames of REP-105; None when lost."""
         return self._session.localiser.T_map_odom
 
     def on_earth(self, found: Localisation) -> EarthPose | None:
-        """The ego on Earth, where the map is."""
+        """Returns the ego's pose on Earth, if the map is georeferenced."""
         return None if found.T_map_ego is None else self.map.on_earth(found.T_map_ego, found.cov)
 
     @property
     def unsaved(self) -> bool:
-        """Whether the map has keyframes that its file lacks."""
+        """Whether the map has keyframes that are not saved."""
         return self._choice.extend and len(self.map) > self._saved
 
     def save(self) -> int:
-        """The map so far, whole, where it may be written; gives its size in bytes. Raises MapError."""
+        """Writes the current map if the drive extends it; returns its size in bytes. Raises MapError."""
         if not self._choice.extend:
             return 0
         size = write_map(self._choice.path, self.map)
@@ -127,7 +126,7 @@ class MapDrive:
         return size
 
     def end(self) -> None:
-        """The last keyframes, loops closed, and the files of the drive. Raises OSError."""
+        """Adds the last keyframes, closes loops, and completes the files of the drive. Raises OSError."""
         self._session.finish()
         self._write(self._trajectory.finish())
         if self.unwritten is None:
@@ -136,7 +135,7 @@ class MapDrive:
             raise self.unwritten
 
     def summary(self) -> dict[str, Any]:
-        """For summary.json, once ended."""
+        """Returns the entries of summary.json after `end`."""
         first_ns, begin_ns = self._trajectory.first_ns, self._begin_ns
         return {
             "file": str(self._choice.path),
@@ -150,19 +149,19 @@ class MapDrive:
         }
 
     def write(self, summary: dict[str, Any]) -> None:
-        """The map at the end of the drive, where it may be written. Raises MapError."""
+        """Writes the map at the end of the drive, if the drive extends it. Raises MapError."""
         if not self._choice.extend:
             return
         if len(self.map):
             summary["bytes"] = self.save()
         else:
-            summary["file"] = None  # nothing that a later drive could be found by
+            summary["file"] = None  # no keyframe for a later drive to match
 
 
 def rows(found: dict[str, Any]) -> list[tuple[str, str]]:
-    """The lines of a run's table that speak of the map."""
+    """Returns the rows of a run's summary table about the map."""
     if "error" in found:
-        return [("map", f"NOT KEPT: {found['error']}")]
+        return [("map", f"NOT SAVED: {found['error']}")]
     frames = sum(found[state.value] for state in MapState)
     out = [("localised in the map", f"{found['localised']} of {frames} frames: map.tum.txt, localisation.csv")]
     if found["time_to_localise_s"] is not None:
@@ -171,7 +170,7 @@ def rows(found: dict[str, Any]) -> list[tuple[str, str]]:
         size = f"{found['keyframes']} keyframes, {found['new_keyframes']} of them new, {found['bytes'] / 1e6:.2f} MB"
         out.append(("map", f"{found['file']}: {size}"))
     elif found["file"] is None:
-        out.append(("map", "none: no keyframe could be made of this drive"))
+        out.append(("map", "none: the drive gave no keyframe"))
     if found["keyframes_without_place"]:
-        out.append(("  without a place", f"{found['keyframes_without_place']} keyframes: the drive never met the map"))
+        out.append(("  not in the map", f"{found['keyframes_without_place']} keyframes: the drive never met the map"))
     return out

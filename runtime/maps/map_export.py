@@ -1,4 +1,4 @@
-"""A map in the formats of others: its graph as g2o, its keyframes as TUM lines, its ways and lines."""
+"""Exports a map: its graph as g2o, its keyframes as TUM lines, its trajectories and lane lines."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from birdslam.loops.place_map import PlaceMap
 from birdslam.outputs.earth_files import SUFFIXES, Way, write_ways
 from birdslam.trajectory import ego_pose, tum_row
 
-IN_METRES = ".map.geojson"  # of the map
+IN_METRES = ".map.geojson"  # in the map frame
 FORMATS = ".g2o, .tum.txt, .map.geojson, .geojson, .gpx, .kml"
 
 
 def export_map(place_map: PlaceMap, path: Path) -> str:
-    """Writes it; says what. Raises MapError."""
+    """Writes the map; returns a description of the content. Raises MapError."""
     try:
         if path.suffix == ".g2o":
             path.write_text("".join(f"{line}\n" for line in _g2o(place_map)), encoding="ascii")
@@ -33,12 +33,12 @@ def export_map(place_map: PlaceMap, path: Path) -> str:
                 path.write_bytes(_in_metres([*ways, *lines]))
             elif place_map.earth is None:
                 raise MapError(
-                    f"{path}: the map is not on Earth yet: drive with --map and --gnss, or export {IN_METRES}"
+                    f"{path}: the map is not georeferenced; drive with --map and --gnss, or export {IN_METRES}"
                 )
             else:
                 earth = place_map.earth
                 write_ways(path, [replace(way, degrees=earth.wgs84(way.degrees)) for way in (*ways, *lines)])
-            return f"{len(ways)} ways and {len(lines)} lines"
+            return f"{len(ways)} trajectories and {len(lines)} lines"
     except OSError as error:
         raise MapError(f"{path}: can't be written: {error.strerror}") from None
     raise MapError(f"{path}: a map is exported as {FORMATS}")
@@ -58,7 +58,7 @@ def _g2o(place_map: PlaceMap) -> list[str]:
 
 
 def _ways(place_map: PlaceMap) -> list[Way]:
-    """The drives' ways, in metres of the map."""
+    """Returns the trajectories of the drives, in the map frame."""
     out = []
     for drive in range(place_map.drives):
         own = [each.T_map_keyframe for each in place_map.keyframes if each.drive == drive]
@@ -69,7 +69,7 @@ def _ways(place_map: PlaceMap) -> list[Way]:
 
 
 def _lines(place_map: PlaceMap) -> list[Way]:
-    """The road's lines, in metres of the map."""
+    """Returns the lane lines, in the map frame."""
     return [
         Way(
             f"{each.kind.value} {each.line}",

@@ -1,10 +1,8 @@
-"""The map process: it subscribes, localises the drive in a map and makes that longer; no node waits for it.
+"""The map process: localises the drive in a map and extends the map; no node waits for it.
 
-`python -m birdslam.runtime.maps.map_process map VITALS_FD PARENT_PID`, on standard input the configuration as a line of
-JSON, then an `Assignment` as another. It ends when the end of the source has come through, or on SIGTERM. Exit status:
-0 when all is written; 2 where the map can't be used, 3 where the disk failed it in the end, each with one ERROR line;
-1 for a bug. One that died or stalled is restarted with the map as it was last saved, and goes on where it had come to
-if odometry does. Its map is saved whole every ten seconds or so; a disk that is full costs what was not saved yet.
+`python -m birdslam.runtime.maps.map_process map VITALS_FD PARENT_PID`; standard input: the configuration and an
+`Assignment`, one line of JSON each. Ends after END_OF_SOURCE or on SIGTERM. Exit status: 0 complete, 1 bug, 2 unusable
+map, 3 disk failure. Saves the map about every ten seconds; a restarted process continues from the last saved one.
 """
 
 from __future__ import annotations
@@ -43,24 +41,22 @@ from birdslam.runtime.transport.ring import FrameError, FrameReader
 from birdslam.runtime.wire import Health, WireError, decode, encode
 from birdslam.types import Estimate, FrameRef, Status
 
-TURN_S = 0.05  # what has come is taken up at least so often
-END_S = 2.0  # after SIGTERM, for the end of the source to come through
+TURN_S = 0.05  # max. interval between two turns
+END_S = 2.0  # after SIGTERM, for END_OF_SOURCE to arrive
 HEALTH_NS = 1_000_000_000
-WAITING_ESTIMATES = 1024  # while a loop is closed
-HELD_MIB = 8.0, 46.0  # of small objects and of others: WAITING_ESTIMATES as bytes, 10 kB each, and what a look needs
-WAITING_IMAGES = 4  # of frames whose estimates have not come yet: the oldest, however late estimates are
-# Of one core, that looking at images may take in the long run; odometry carries the frames between. What it takes the
-# frames feel, whatever its priority: caches and memory are shared
-CPU_SHARE = 0.25
-SAVE_EVERY_S, SAVE_SHARE = 10.0, 0.02  # and a large map so seldom that writing it takes no more of the time
-NICENESS = 10  # all others go first
-SUMMARY = "map.json"  # beside the logs: what the supervisor puts into summary.json
+WAITING_ESTIMATES = 1024  # queue while a loop is closed
+HELD_MIB = 8.0, 46.0  # reserved for small objects and for WAITING_ESTIMATES as bytes and the work on an image
+WAITING_IMAGES = 4  # of frames without an estimate yet, the oldest ones
+CPU_SHARE = 0.25  # of one core for images; more slows the pipeline down through shared caches, at any priority
+SAVE_EVERY_S, MAX_SAVE_RATIO = 10.0, 0.02  # min. interval, and max. share of the time
+NICENESS = 10  # below all other processes
+SUMMARY = "map.json"  # beside the logs: entries for summary.json
 
 log = logging.getLogger(__name__)
 
 
 class LiveMap:
-    """From the bus into the map, and `map_pose` back."""
+    """Localises and maps from the messages of the bus; publishes `map_pose`."""
 
     def __init__(self, configuration: Configuration, bus: Bus, vitals: Vitals, assignment: Assignment) -> None:
         """Raises MapError, ConfigurationError, OSError."""
@@ -78,17 +74,17 @@ class LiveMap:
         self._drive = MapDrive(choice, camera, self._output)
         self._last_pose = runtime_dir_of(configuration.vehicle, configuration.runtime_dir) / "map_pose"
         if assignment.restarts:
-            self._go_on()
+            self._resume()
         else:
             self._last_pose.unlink(missing_ok=True)
         gnss = configuration.results.gnss
         self._fixes: list[GnssFix] = []
         self._receiver = Receiver(gnss) if gnss and is_serial(gnss) else None
         self._recorded = recorded_fixes(configuration)
-        self._clock_ns = 0  # of the source, from CLOCK_MONOTONIC
+        self._clock_ns = 0  # of the source less CLOCK_MONOTONIC
         self._newest: MapPose | None = None
         self._saved_epoch = 0  # of the map in the file
-        self._next_look_ns = 0  # CLOCK_MONOTONIC, by the budget
+        self._next_look_ns = 0  # CLOCK_MONOTONIC, by CPU_SHARE
         self._saved_s, self._save_took_s = time.monotonic(), 0.0
         self._process = psutil.Process()
         self._process.cpu_percent()
@@ -96,18 +92,15 @@ class LiveMap:
         self.looks = self.torn = 0
         self.ended = False
 
-    def _go_on(self) -> None:
-        """Where the process before this one had come to; it holds where odometry's epoch is still the same."""
+    def _resume(self) -> None:
+        """Continues from the last pose of the previous process, which is valid while odometry's epoch is the same."""
         try:
             self._drive.resume(decode(self._last_pose.read_bytes(), MapPose))
         except (OSError, WireError) as error:
-            log.warning("where the map process had come to is not known: %s", error)
+            log.warning("the last pose of the previous map process is unknown: %s", error)
 
     def turn(self, timeout_s: float) -> bool:
-        """Takes up one estimate, and the images that have come; whether there was one.
-
-        One, so that a process that can't keep up reports, saves and beats like any other.
-        """
+        """Processes one estimate and the images that have arrived; returns whether there was an estimate."""
         message = self._estimates.recv(timeout_s)
         self._take_images()
         if message is not None and not self.ended:
@@ -126,7 +119,7 @@ class LiveMap:
         return message is not None
 
     def _take_images(self) -> None:
-        """Pixels stay in the ring for a few frames only; of those that will not be looked at none is copied."""
+        """Copies the images that will be processed, since pixels stay in the ring for a few frames only."""
         while (message := self._frames.recv(0.0)) is not None:
             ref: FrameRef = message.record
             if ref.slot < 0 or ref.t_capture_ns < self._next_look_ns or len(self._images) == WAITING_IMAGES:
@@ -136,7 +129,7 @@ class LiveMap:
                 if image is not None:
                     self._images[ref.frame_id] = image
             except FrameError as error:
-                log.warning("frame %d is not looked at: %s", ref.frame_id, error)
+                log.warning("frame %d is skipped: %s", ref.frame_id, error)
                 image = None
             self.torn += image is None
 
@@ -145,11 +138,11 @@ class LiveMap:
         while self._images and next(iter(self._images)) <= estimate.frame_id:
             frame_id, pixels = self._images.popitem(last=False)
             image = pixels if frame_id == estimate.frame_id else None
-        begun_s = time.process_time()
+        start_s = time.process_time()
         looked = image is not None and self._drive.due(estimate)
         found = self._drive.step(estimate, self._undistort(image) if image is not None and looked else None)
         if looked:
-            took_ns = (time.process_time() - begun_s) * 1e9
+            took_ns = (time.process_time() - start_s) * 1e9
             self._next_look_ns = estimate.t_capture_ns + round(took_ns / CPU_SHARE)
             self.looks += 1
         self._stepped += 1
@@ -197,35 +190,35 @@ class LiveMap:
         )
         self._health.put(health)
         if self._newest is not None and self._newest.map_epoch == self._saved_epoch:
-            self._keep(self._newest)
+            self._store_pose(self._newest)
 
-    def _keep(self, pose: MapPose) -> None:
-        """For the process after this one: where the drive is in the map as its file has it."""
+    def _store_pose(self, pose: MapPose) -> None:
+        """Stores the pose in the saved map for a restarted process."""
         draft = self._last_pose.with_suffix(".draft")
         try:
             draft.write_bytes(encode(pose))
             draft.replace(self._last_pose)
         except OSError as error:
-            log.warning("where the map process is can't be kept: %s", error)
+            log.warning("the pose of the map process can't be stored: %s", error)
 
     def _save_due(self) -> bool:
         old = self._drive.unsaved or (self._newest is not None and self._newest.map_epoch != self._saved_epoch)
-        return old and time.monotonic() - self._saved_s > max(SAVE_EVERY_S, self._save_took_s / SAVE_SHARE)
+        return old and time.monotonic() - self._saved_s > max(SAVE_EVERY_S, self._save_took_s / MAX_SAVE_RATIO)
 
     def _save(self) -> None:
-        begun_s = time.monotonic()
+        start_s = time.monotonic()
         try:
             self._drive.save()
             if self._newest is not None:
                 self._saved_epoch = self._newest.map_epoch
-                self._keep(self._newest)
+                self._store_pose(self._newest)
         except MapError as error:
             log.warning("%s", error)
         self._saved_s = time.monotonic()
-        self._save_took_s = self._saved_s - begun_s
+        self._save_took_s = self._saved_s - start_s
 
     def finish(self) -> str:
-        """Ends the drive, and writes the map; why it could not be written, or nothing."""
+        """Ends the drive and writes the map; returns the reason of a failure, or ""."""
         summary: dict[str, Any] = {}
         reason = ""
         try:
@@ -234,7 +227,7 @@ class LiveMap:
             reason = f"{self._output}: can't be written: {failure.strerror}"
         try:
             summary["map"] = self._drive.summary() | {"looks": self.looks, "torn": self.torn}
-            places = self._come_to_earth(summary)
+            places = self._georeference(summary)
             self._drive.write(summary["map"])
             write_places(self._output, places)
         except (MapError, OSError) as failure:
@@ -247,8 +240,8 @@ class LiveMap:
             reason = reason or f"{self._output}: can't be written: {failure.strerror}"
         return reason
 
-    def _come_to_earth(self, summary: dict[str, Any]) -> list[Place]:
-        """The drive's places. What is wrong with the fixes costs the map nothing."""
+    def _georeference(self, summary: dict[str, Any]) -> list[Place]:
+        """Returns the drive's places, georeferenced if possible; unusable fixes do not affect the map."""
         fixes: Fixes | list[GnssFix] | None = self._recorded
         if self._receiver is not None:
             fixes = [*self._fixes, *self._receiver.take(self._clock_ns)]
@@ -261,13 +254,13 @@ class LiveMap:
             summary["earth"], places = write_earth(fixes, places, self._config.camera, self._output, self._drive.map)
             return places
         except (GnssError, EarthError) as error:
-            log.warning("the drive is not on Earth: %s", error)
+            log.warning("the drive is not georeferenced: %s", error)
             return self._drive.places
 
 
 def localise(configuration: Configuration, assignment: Assignment, vitals: Vitals, stop: Stop) -> int:
-    """The whole work of the process; its exit status."""
-    import faiss  # noqa: F401  # now, and not with the first look-up in the middle of the drive
+    """Runs the map process; returns its exit status."""
+    import faiss  # noqa: F401  # load it before the drive
 
     with Bus(configuration.vehicle, MAP.name, runtime_dir=configuration.runtime_dir) as bus:
         try:
@@ -285,7 +278,7 @@ def localise(configuration: Configuration, assignment: Assignment, vitals: Vital
             live.turn(TURN_S)
             if stop.asked and until_s is None:
                 until_s = time.monotonic() + END_S
-        vitals.count(ready=0)  # no beat any more: it closes loops and waits for the disk
+        vitals.count(ready=0)  # no more beats while it closes loops and waits for the disk
         reason = live.finish()
     if reason:
         log.error("%s", reason)

@@ -1,4 +1,4 @@
-"""Maps on the disk: read whole or refused, written whole or not at all."""
+"""Reads and writes map files; writing is atomic."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from birdslam.loops.place_map import PlaceMap
 
 
 def read_map(path: Path) -> PlaceMap:
-    """Raises MapError, which names the file and says what is wrong with it."""
+    """Reads a map. Raises MapError with the file and the reason."""
     try:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
@@ -24,10 +24,7 @@ def read_map(path: Path) -> PlaceMap:
 
 
 def write_map(path: Path, place_map: PlaceMap) -> int:
-    """Beside the old file first, on the disk, and then in its place; gives its size in bytes. Raises MapError.
-
-    Whatever goes wrong, the old file stays.
-    """
+    """Writes a map atomically; returns its size in bytes. Raises MapError; the old file then stays."""
     data = encode_map(place_map)
     temporary = None
     try:
@@ -41,14 +38,14 @@ def write_map(path: Path, place_map: PlaceMap) -> int:
     except OSError as error:
         if temporary is not None:
             Path(temporary).unlink(missing_ok=True)
-        raise MapError(f"{path}: can't be written, what was there stays: {error.strerror}") from None
+        raise MapError(f"{path}: can't be written, the old file is kept: {error.strerror}") from None
     return len(data)
 
 
 def check_map(path: Path, extend: bool) -> PlaceMap | None:
-    """The map that a drive begins with; None: a new one. Raises MapError for one that the drive could not use."""
+    """Returns the initial map of a drive; None: a new one. Raises MapError for an unusable file."""
     if path.exists() or not extend:
         return read_map(path)
     if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
-        raise MapError(f"{path}: can't be written: no such folder, or not one to write in")
+        raise MapError(f"{path}: can't be written: the folder does not exist or is not writable")
     return None

@@ -66,7 +66,7 @@ class CaptureNode:
         """Returns the next frame when it is due, at rate "max" when few enough are in flight; at last END_OF_SOURCE."""
         until_s = time.monotonic() + timeout_s
         if self._reader is None:
-            first_frame = 0 if self._resume is None else self._go_on(self._resume)
+            first_frame = 0 if self._resume is None else self._resume_frame(self._resume)
             capacity = 1 if self._source.live else self._config.source.prefetch_frames
             self._reader = ReadAhead(self._source, capacity, first_frame)
             self._quiet_since_s = time.monotonic()
@@ -96,7 +96,7 @@ class CaptureNode:
         self._quiet_since_s = time.monotonic()
         return Message(Captured(frame_id, recorded, t_capture_ns), Trace(), t_capture_ns)
 
-    def _go_on(self, resume: Resume) -> int:
+    def _resume_frame(self, resume: Resume) -> int:
         """Returns the frame that is due now. It skips at least one, so that perceive sees a gap."""
         rate = self._config.source.rate
         hz = rate if isinstance(rate, float) else self._source.rate_hz

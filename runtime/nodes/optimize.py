@@ -145,9 +145,9 @@ class OptimizeNode:
         gained = self._graph.map_update()
         if gained is not None:
             yield gained
-        self._keep(record.frame_id)  # after the records are sent, so that it delays none
+        self._store_checkpoint(record.frame_id)  # after the records are sent, so that it delays none
 
-    def _keep(self, frame_id: int) -> None:
+    def _store_checkpoint(self, frame_id: int) -> None:
         """Stores a checkpoint if one is due."""
         now_ns = time.monotonic_ns()
         if self._checkpoints is not None and now_ns >= self._due_ns:

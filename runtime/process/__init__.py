@@ -1,4 +1,1 @@
-"""What every process of a vehicle has: scheduling, heartbeat, restarts, notifications to systemd.
-
-Read `child` first: what a process does before its work begins.
-"""
+"""Common parts of all processes of a vehicle: start (`child`), scheduling, heartbeat, restarts, systemd."""

@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 
 
 class Stop:
-    """SIGTERM: it is to end."""
+    """Records whether SIGTERM was received."""
 
     def __init__(self) -> None:
         self.asked = False
@@ -35,9 +35,9 @@ class Stop:
 
 
 def run_beside(work: Callable[[Configuration, _Order, Vitals, Stop], int], order: type[_Order], niceness: int) -> None:
-    """`NAME VITALS_FD PARENT_PID`, on standard input the configuration and then its order, as lines of JSON each.
+    """Runs `work` and exits with its status; 0: complete, counted as ended; 1: bug.
 
-    Ends the process with what `work` gives; 0: all is done, and it counts as ended. 1 for a bug.
+    Arguments `NAME VITALS_FD PARENT_PID`; standard input: the configuration and the order, one line of JSON each.
     """
     stop = Stop()
     name, configuration, vitals = begin(sys.argv[1:])

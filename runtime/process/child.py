@@ -19,9 +19,9 @@ _PR_SET_PDEATHSIG = 1
 
 
 def begin(arguments: Sequence[str]) -> tuple[str, Configuration, Vitals]:
-    """Its name, its configuration (a line of JSON on standard input) and its vital signs, by NODE VITALS_FD PARENT_PID.
+    """Returns name, configuration (a line of JSON on standard input) and vitals, given NODE VITALS_FD PARENT_PID.
 
-    It logs to standard error, where the supervisor keeps it, and ends with the supervisor.
+    Logs to standard error, which the supervisor redirects to a file; ends the process with the supervisor.
     """
     name, vitals_fd, parent_pid = arguments
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")

@@ -1,4 +1,4 @@
-"""Notifications to systemd (sd_notify(3)): ready, alive, the status line, stopping; and a service's work until then."""
+"""Notifications to systemd (sd_notify(3)): ready, watchdog, status line, stopping."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 
 from birdslam.runtime.process import signals
 
-LOOK_S = 1.0  # how often the status line is written where systemd watches nothing
+STATUS_S = 1.0  # period of the status line without a watchdog
 
 
 class Notifier:
@@ -23,14 +23,14 @@ class Notifier:
         self._address = "\0" + address[1:] if address.startswith("@") else address
         for_us = environment.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
         watchdog_us = int(environment.get("WATCHDOG_USEC") or 0) if for_us else 0
-        self.period_s = watchdog_us / 1e6 / 3 if watchdog_us else None  # of `alive`; None: nobody watches
+        self.period_s = watchdog_us / 1e6 / 3 if watchdog_us else None  # of `alive`; None: no watchdog
         self._due_s = 0.0
-        self._said: set[str] = set()
+        self._sent: set[str] = set()
 
     def once(self, state: str) -> None:
         """Sends READY=1 or STOPPING=1 once."""
-        if state not in self._said:
-            self._said.add(state)
+        if state not in self._sent:
+            self._sent.add(state)
             self._send(state)
 
     def alive(self, status: str) -> None:
@@ -51,11 +51,11 @@ class Notifier:
                 return
 
 
-def serve(said: str, status: Callable[[], str]) -> None:
-    """What a service does whose work goes on by itself: it says that it is open, and waits to be asked to end."""
+def serve(greeting: str, status: Callable[[], str]) -> None:
+    """Prints the greeting, notifies systemd, and waits for SIGTERM or SIGINT while other threads do the work."""
     notifier = Notifier()
-    print(said, flush=True)
+    print(greeting, flush=True)
     notifier.once("READY=1")
-    while not signals.asked_to_end(notifier.period_s or LOOK_S):
+    while not signals.asked_to_end(notifier.period_s or STATUS_S):
         notifier.alive(status())
     notifier.once("STOPPING=1")

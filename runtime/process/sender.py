@@ -1,6 +1,6 @@
-"""The process of a sender: it waits for its router, sends until it is asked to end, and lives through the router's end.
+"""A process that sends to a router: waits for it, sends until SIGTERM or SIGINT, and reconnects after a loss.
 
-Its vehicle waits for no network: it notifies systemd at once.
+It notifies systemd at once, so that the vehicle does not wait for the network.
 """
 
 from __future__ import annotations
@@ -12,21 +12,21 @@ from contextlib import AbstractContextManager
 from typing import Protocol, TypeVar
 
 from birdslam.runtime.process import signals
-from birdslam.runtime.process.notify import LOOK_S, Notifier
+from birdslam.runtime.process.notify import STATUS_S, Notifier
 
-REPORT_S = 60.0  # between two lines that say that there is no router
+REPORT_S = 60.0  # between two messages about a missing router
 _Link = TypeVar("_Link")
 
 
 class RateLimit:
-    """Lets so many a second through in the mean, and no burst after a pause; without a rate everything."""
+    """Limits the mean rate, without a burst after a pause; without a rate it passes everything."""
 
     def __init__(self, rate_hz: float | None) -> None:
         self._period_ns = 0 if rate_hz is None else round(1e9 / rate_hz)
         self._due_ns = 0
 
     def passes(self, now_ns: int) -> bool:
-        """Whether what is to be sent now is sent."""
+        """Whether a message may be sent now."""
         late_ns = now_ns - self._due_ns
         if late_ns < 0:
             return False
@@ -35,20 +35,20 @@ class RateLimit:
 
 
 class Sender(AbstractContextManager["Sender"], Protocol):
-    """What sends while it is entered."""
+    """A context manager that sends while it is entered."""
 
     pause_s: float  # between two steps
 
     @property
     def connected(self) -> bool:
-        """Whether the router is there now."""
+        """Whether the router is connected."""
 
     @property
     def alive(self) -> frozenset[str]:
         """The vehicle's nodes that are alive."""
 
     def step(self) -> None:
-        """Sends what has come; nothing to do for one that sends on threads of its own."""
+        """Sends what has arrived; does nothing if it sends on its own threads."""
 
 
 def send(
@@ -59,9 +59,9 @@ def send(
     missing: type[Exception],
     begin: Callable[[_Link], Sender],
 ) -> None:
-    """Until SIGTERM or SIGINT. `connect` raises `missing` while there is no router.
+    """Sends until SIGTERM or SIGINT. `connect` raises `missing` while there is no router.
 
-    `name` stands in lines of standard error, `who` in those that say that the router was reached or lost.
+    `name` is the prefix of error messages, `who` of messages about the connection.
     """
     notifier = Notifier()
     notifier.once("READY=1")
@@ -74,9 +74,9 @@ def send(
             sender.step()
             if (now := sender.connected) != reached:
                 reached = now
-                state = f"is connected to {router}" if now else f"has lost {router} and looks for it"
+                state = f"is connected to {router}" if now else f"has lost {router} and is reconnecting"
                 print(f"{who} {state}", flush=True)
-            notifier.alive(f"router {'reached' if reached else 'GONE'}, {len(sender.alive)} nodes alive")
+            notifier.alive(f"router {'connected' if reached else 'LOST'}, {len(sender.alive)} nodes alive")
             if signals.asked_to_end(min(sender.pause_s, notifier.period_s or sender.pause_s)):
                 break
         notifier.once("STOPPING=1")
@@ -85,7 +85,7 @@ def send(
 def _connected(
     name: str, router: str, connect: Callable[[], _Link], missing: type[Exception], notifier: Notifier
 ) -> _Link | None:
-    """The link, as soon as it can be had; None where a signal came first."""
+    """Returns the link when connected; None after a signal."""
     reported_s = -REPORT_S
     while True:
         try:
@@ -94,6 +94,6 @@ def _connected(
             if time.monotonic() - reported_s >= REPORT_S:
                 reported_s = time.monotonic()
                 print(f"birdslam: {name}: {error}", file=sys.stderr, flush=True)
-        notifier.alive(f"looks for {router}")
-        if signals.asked_to_end(LOOK_S):  # a refusal may come at once
+        notifier.alive(f"connecting to {router}")
+        if signals.asked_to_end(STATUS_S):  # a refused connection fails at once
             return None

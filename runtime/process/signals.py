@@ -8,15 +8,14 @@ ENDING = frozenset({signal.SIGTERM, signal.SIGINT})
 
 
 def block() -> None:
-    """Keeps SIGTERM and SIGINT for `asked_to_end`; before any other thread is there, since those inherit it."""
+    """Blocks SIGTERM and SIGINT for `asked_to_end`; call it before other threads start, which inherit the mask."""
     signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
 
 
 def asked_to_end(timeout_s: float) -> bool:
-    """Whether one of the two came within the time; they are blocked (`block`).
+    """Whether SIGTERM or SIGINT arrives within the time; both must be blocked (`block`).
 
-    A process that was stopped (SIGSTOP) and goes on after the time-out gets a result
-    from Python in which nothing is set: only a number that was asked for counts.
+    After SIGSTOP and SIGCONT Python may return an empty result, so the signal number is checked.
     """
     found = signal.sigtimedwait(ENDING, timeout_s)
     return found is not None and found.si_signo in ENDING

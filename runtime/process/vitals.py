@@ -20,11 +20,10 @@ COUNTERS = (
 
 
 class Vitals:
-    """Counters of one node, all from zero.
+    """Counters of one node, starting at zero.
 
-    `beat_ns` is CLOCK_MONOTONIC of its loop's last turn. `prepared` turns 1 when all that takes long is loaded, `ready`
-    when it is at work, `ended` when the end of the source went through. `next_frame` is one more than the last frame
-    that it sent, stored before it was sent, with that frame's times.
+    `beat_ns`: CLOCK_MONOTONIC of the last heartbeat. Flags: `prepared` after loading, `ready` at work, `ended` after
+    END_OF_SOURCE. `next_frame`: the last sent frame plus one, stored before sending, with that frame's times.
     """
 
     def __init__(self, fd: int | None = None) -> None:

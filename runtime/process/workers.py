@@ -1,4 +1,4 @@
-"""Worker processes for work that is cut into tasks: one pool for all commands that have one."""
+"""A pool of worker processes for commands that run tasks in parallel."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from birdslam.runtime.process.child import end_with_parent
 
 @contextmanager
 def workers(processes: int) -> Iterator[ProcessPoolExecutor]:
-    """A pool of `processes` processes, spawned and not forked, so that no lock of this process's threads is inherited.
+    """A pool of `processes` spawned processes; a fork would inherit locks of this process's threads.
 
-    They end with this process, also where it is killed and can't shut them down. Where the block raises, tasks that
-    have not begun are dropped, and it isn't waited for the others.
+    They end with this process, also if it is killed. If the block raises, waiting tasks are cancelled and running ones
+    are not waited for.
     """
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(

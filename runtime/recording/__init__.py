@@ -1,5 +1,4 @@
-"""A drive as one MCAP file: written while it goes on, and read again.
+"""A drive as one MCAP file: writing, reading, and viewing.
 
-Read `recording` first; `scene` turns records into messages that Foxglove draws, `recorded_images` plays a
-recording's images as a source.
+Read `recording` first; `scene` converts records to Foxglove messages, `recorded_images` is a source of recorded images.
 """

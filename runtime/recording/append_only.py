@@ -1,4 +1,4 @@
-"""An append-only file, written by a thread of its own: the caller never waits for the disk."""
+"""An append-only file, written by a thread so that the caller does not wait for the disk."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import threading
 from collections import deque
 from pathlib import Path
 
-WAITING_BYTES = 1 << 26  # behind a disk that stalls; then `write` waits
+MAX_WAITING_BYTES = 1 << 26  # queued while the disk stalls; then `write` waits
 
 
 class AppendOnlyFile:
-    """Pieces of a file, each written whole or cut off again, and brought to the disk (fdatasync) one after the other.
+    """Appends pieces to a file, each completely or not at all, and syncs them to the disk (fdatasync).
 
-    What was written survives a kill -9 of this process, what was synced a power cut. A disk that fails (it is full)
-    ends it: `error` says why, the file ends with its last whole piece, and later pieces are thrown away.
-    Raises OSError where the file can't be made, FileExistsError where there is one.
+    Written pieces survive a kill -9 of this process, synced ones a power cut. A disk failure sets `error`: the file
+    ends with its last complete piece, and later pieces are discarded. Raises OSError if the file can't be created,
+    FileExistsError if it exists.
     """
 
     def __init__(self, path: Path, sync: bool = True) -> None:
@@ -33,7 +33,7 @@ class AppendOnlyFile:
     def write(self, piece: bytes) -> None:
         """Queues one piece for the disk."""
         with self._changed:
-            self._changed.wait_for(lambda: self._waiting_bytes < WAITING_BYTES or self.error is not None)
+            self._changed.wait_for(lambda: self._waiting_bytes < MAX_WAITING_BYTES or self.error is not None)
             if self.error is None:
                 self._pieces.append(piece)
                 self._waiting_bytes += len(piece)
@@ -65,12 +65,12 @@ class AppendOnlyFile:
         self.written_bytes += len(piece)
 
     def _fail(self, error: OSError) -> None:
-        """Takes back what of the piece was written: a torn end would only confuse readers."""
+        """Truncates the file to its last complete piece."""
         self.error = error
         os.ftruncate(self._fd, self.written_bytes)
 
     def close(self) -> None:
-        """Waits until all is written."""
+        """Waits until all pieces are written, then closes the file."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()

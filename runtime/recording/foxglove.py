@@ -1,6 +1,6 @@
-"""The types of Foxglove that a recording uses (https://docs.foxglove.dev, "Message schemas"), and their JSON schemas.
+"""The Foxglove types that a recording uses (https://docs.foxglove.dev, "Message schemas"), and their JSON schemas.
 
-Each struct bears the name and the fields of the Foxglove type; bytes become base64, as its schemas have it.
+Structs and fields have the names of the Foxglove types; bytes are encoded as base64.
 """
 
 from __future__ import annotations
@@ -9,9 +9,9 @@ from typing import Any
 
 import msgspec
 
-FLOAT32 = 7  # PackedElementField's numeric type
-LINE_STRIP, LINE_LOOP = 0, 1  # LinePrimitive's types
-ALL = 1  # SceneEntityDeletion's type
+FLOAT32 = 7  # numeric type of PackedElementField
+LINE_STRIP, LINE_LOOP = 0, 1  # types of LinePrimitive
+ALL = 1  # type of SceneEntityDeletion
 
 
 class Time(msgspec.Struct, frozen=True):
@@ -174,16 +174,16 @@ class ImageAnnotations(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def schema(record: type[msgspec.Struct]) -> bytes:
-    """The JSON schema of a struct as Foxglove takes it: an object at the top, no unions.
+    """Returns the JSON schema of a struct for Foxglove: an object at the top, no unions.
 
-    What Foxglove allows and its open forks (Lichtblick) do not is left out too: references, objects of unknown fields.
+    It also avoids references and objects of unknown fields, which Lichtblick does not support.
     """
     (top,), parts = msgspec.json.schema_components([record], ref_template="{name}")
     return msgspec.json.encode(_simple(top, parts))
 
 
 def _simple(part: Any, parts: dict[str, Any]) -> Any:
-    """References as what they refer to, tuples of one type as arrays, what may be null as what it is else."""
+    """Resolves references, converts tuples of one type to arrays, and removes null from unions."""
     if isinstance(part, list):
         return [_simple(item, parts) for item in part]
     if not isinstance(part, dict):
@@ -197,7 +197,7 @@ def _simple(part: Any, parts: dict[str, Any]) -> Any:
     if "prefixItems" in part:
         part["items"], *others = part.pop("prefixItems")
         if any(other != part["items"] for other in others):
-            part["items"] = {}  # of any type: no channel that Foxglove reads has them
+            part["items"] = {}  # of any type; not in channels that Foxglove draws
     if "enum" in part:
         part = {"type": "string"}
     if part.get("type") == "object":

@@ -1,4 +1,4 @@
-"""A recorded drive frame by frame, as the pipeline gave it: Measurements, Estimate, and what the map gained."""
+"""Reads a recorded drive frame by frame: Measurements, Estimate and MapUpdate."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from birdslam.runtime.recording.recording import Recorded, Recording, RecordingE
 from birdslam.runtime.wire import WireError, decode
 from birdslam.types import Estimate, MapUpdate, Measurements, Status
 
-PATIENCE = 64  # estimates and map updates that wait for measurements which were written after them
+MAX_WAITING = 64  # estimates and map updates that wait for measurements written after them
 READ = ("v1/measurements", "v1/estimate", "v1/map")
 
 _Record = TypeVar("_Record", bound=msgspec.Struct)
 
 
 def measurements_of(recordings: Iterable[Recording]) -> Iterator[Measurements]:
-    """All measurements in the order in which they were written. Raises RecordingError where one does not decode."""
+    """Yields all measurements in the order of the file. Raises RecordingError for one that does not decode."""
     for recording in recordings:
         for message in recording.messages(READ[:1]):
             yield _record(recording, message, Measurements)
 
 
 def recorded_drive(recordings: Iterable[Recording]) -> Iterator[Measurements | Estimate | MapUpdate]:
-    """Every estimate that rests on measurements, after its Measurements where the recording has them.
+    """Yields every estimate, after its Measurements if they were recorded, and the map updates.
 
-    The files of one run in their order. Estimates of frames that nobody measured in time (PERCEPTION_LATE) are left
-    out, as in a run's results. Raises RecordingError where one does not decode.
+    `recordings`: the files of one run in order. Estimates without measurements in time (PERCEPTION_LATE) are skipped,
+    as in a run's results. Raises RecordingError for a record that does not decode.
     """
     for recording in recordings:
         waiting: deque[Estimate | MapUpdate] = deque()
@@ -44,17 +44,17 @@ def recorded_drive(recordings: Iterable[Recording]) -> Iterator[Measurements | E
                 estimate = _record(recording, message, Estimate)
                 if not {Status.END_OF_SOURCE, Status.PERCEPTION_LATE}.intersection(estimate.status):
                     waiting.append(estimate)
-            yield from _released(waiting, measured, PATIENCE)
+            yield from _released(waiting, measured, MAX_WAITING)
         yield from _released(waiting, measured, 0)
 
 
 def _released(
-    waiting: deque[Estimate | MapUpdate], measured: dict[int, Measurements], patience: int
+    waiting: deque[Estimate | MapUpdate], measured: dict[int, Measurements], max_waiting: int
 ) -> Iterator[Measurements | Estimate | MapUpdate]:
     while waiting:
         record = waiting[0]
         if isinstance(record, Estimate):
-            if record.frame_id not in measured and len(waiting) <= patience:
+            if record.frame_id not in measured and len(waiting) <= max_waiting:
                 return
             if record.frame_id in measured:
                 yield measured[record.frame_id]
@@ -67,4 +67,4 @@ def _record(recording: Recording, message: Recorded, kind: type[_Record]) -> _Re
     try:
         return decode(message.data, kind)
     except WireError as error:
-        raise RecordingError(f"{recording.path}: holds no valid {kind.__name__}: {error}") from None
+        raise RecordingError(f"{recording.path}: has an invalid {kind.__name__}: {error}") from None

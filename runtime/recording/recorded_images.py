@@ -1,4 +1,4 @@
-"""The images of a recording as a recorded drive: the whole pipeline runs on them again (`--source mcap:FILE`)."""
+"""The images of a recording as a source for the whole pipeline (`--source mcap:FILE`)."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ READ = ("v1/frame", "/camera/image")
 
 
 class RecordedImages(Recording):
-    """One frame for each that was captured; those that were not recorded (the ring went on) are unreadable ones.
+    """One frame per captured frame; frames that were not recorded are unreadable.
 
-    Each bears the readings of the car's speed that it bore in the drive. The images are as perceive had them, without
-    distortion, but for what JPEG takes. Raises DatasetError.
+    Each has the readings of the car's speed of the drive. The images are undistorted, as in perceive, but compressed as
+    JPEG. Raises DatasetError.
     """
 
     def __init__(self, path: Path, camera: Camera | None = None, stride: int = 1) -> None:
@@ -42,7 +42,7 @@ class RecordedImages(Recording):
         self._stride = stride
         refs = [ref for message in self._file.messages(READ[:1]) if (ref := self._ref(message.data)) is not None]
         if not refs:
-            raise DatasetError(f"{path}: holds no frame")
+            raise DatasetError(f"{path}: has no frame")
         self._first, self._last = refs[0], refs[-1]
         self.first_frame = self._first.frame_id  # of the run; frames count from it
         span_ns = self._last.t_source_ns - self._first.t_source_ns
@@ -50,13 +50,13 @@ class RecordedImages(Recording):
         if frames > 0 and span_ns > 0:
             self.rate_hz = frames * NS_PER_S / span_ns / stride
         else:
-            raise DatasetError(f"{path}: its {len(refs)} frames make no drive")
+            raise DatasetError(f"{path}: has {len(refs)} frames, too few for a drive")
 
     def __len__(self) -> int:
         return (self._last.frame_id - self._first.frame_id) // self._stride + 1
 
     def frames(self, start: int = 0) -> Iterator[RecordedFrame]:
-        """In order; the numbers count from the first frame of the recording."""
+        """Yields the frames in order, numbered from the first frame of the recording."""
         for ref, image in self._pairs():
             number = ref.frame_id - self._first.frame_id
             if number % self._stride or number // self._stride < start:
@@ -66,7 +66,7 @@ class RecordedImages(Recording):
             yield RecordedFrame(number // self._stride, ref.t_source_ns, pixels, error, ref.speeds)
 
     def _pairs(self) -> Iterator[tuple[FrameRef, CompressedImage | None]]:
-        """Every frame with its image; a frame that is missing altogether stands at its time between the two."""
+        """Yields every frame with its image; the times of missing frames are interpolated."""
         before: FrameRef | None = None
         waiting: FrameRef | None = None
         for message in self._file.messages(READ):

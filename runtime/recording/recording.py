@@ -1,9 +1,8 @@
-"""A recorded drive, one MCAP file (https://mcap.dev): written while it goes on, whole or up to where it was cut off.
+"""A recorded drive as one MCAP file (https://mcap.dev); a truncated file is readable up to its end.
 
-Attachments: `about.json` (the whole configuration, the networks with their hashes, versions) and `camera.toml`. A
-replay needs nothing else. Times are UTC by one offset to CLOCK_MONOTONIC, taken at the start, so that they never jump.
-It is written in chunks, at least one in `flush_ms`: a kill or a full disk costs what came after the last. A file
-without its end is read up to there; a chunk that was damaged is left out and counted.
+Attachments: `about.json` (the configuration, the networks with their hashes, versions) and `camera.toml`. Times are
+UTC by one offset to CLOCK_MONOTONIC, taken at the start. A chunk is written every `flush_ms`; a kill or a full disk
+loses the data after the last chunk. Damaged chunks are skipped and counted.
 """
 
 from __future__ import annotations
@@ -32,11 +31,11 @@ from birdslam.runtime.wire import Health, Trace, encode
 from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, SpeedReading
 
 # v1/frame, v1/measurements, v1/estimate, v1/map: MessagePack, the records byte for byte as on the bus (runtime/wire.py)
-# v1/measurements/trace, v1/estimate/trace: MessagePack, the trace of the record with the same sequence number, by which
-#     a replay knows which message an estimate answers
-# v1/checkpoint: MessagePack, once in a file that begins in the middle of a drive: the graph there
+# v1/measurements/trace, v1/estimate/trace: MessagePack, the trace of the record with the same sequence number; a replay
+#     assigns estimates to measurements by it
+# v1/checkpoint: MessagePack, the graph at the start of a file that starts in the middle of a drive
 # /estimate, /health/NODE, /latency, /alive, /speed: JSON with a schema, for plots
-# /tf, /scene, ... (scene.py): JSON with a schema, what Foxglove draws; /camera/image where images were asked for
+# /tf, /scene, ... (scene.py): JSON with a schema, for Foxglove; /camera/image with recording.images
 EXACT: dict[str, type[msgspec.Struct]] = {
     "frame": FrameRef,
     "measurements": Measurements,
@@ -45,7 +44,7 @@ EXACT: dict[str, type[msgspec.Struct]] = {
 }
 TRACED = ("measurements", "estimate")
 CHECKPOINT = "v1/checkpoint"
-MAX_RECORD_BYTES = 1 << 28  # nothing that we write comes near it
+MAX_RECORD_BYTES = 1 << 28  # far above the records that are written
 _TORN = (McapError, struct.error, zlib.error, zstandard.ZstdError, RuntimeError, ValueError, MemoryError)
 
 
@@ -53,20 +52,20 @@ _Part = TypeVar("_Part", bound=msgspec.Struct)
 
 
 class RecordingError(ValueError):
-    """A file that is not a recording, or lacks what is asked for; the message names the file and the reason."""
+    """A file is no recording or lacks a part; the message names the file and the reason."""
 
 
 class Latency(msgspec.Struct, frozen=True, kw_only=True):
-    """Where the time of one frame's estimate went; the parts are those of BudgetsConfig."""
+    """The age of one frame's estimate by stages, which are those of BudgetsConfig."""
 
     frame_id: int
-    age_ms: float  # from the frame's capture until the recorder had its estimate
+    age_ms: float  # from the frame's capture to the recorder's receipt of its estimate
     left_ms: float | None = None  # of the budget when the estimate was done
     stages_ms: dict[str, float] = {}
 
 
 class GraphCheckpoint(msgspec.Struct, frozen=True, kw_only=True):
-    """The optimizer's graph after a frame: where the replay of a file begins whose beginning another one has."""
+    """The optimizer's graph after a frame: the start of a replay of a file without the start of its drive."""
 
     frame_id: int
     epoch: int
@@ -74,20 +73,20 @@ class GraphCheckpoint(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Alive(msgspec.Struct, frozen=True, kw_only=True):
-    """A node became ready for work, or was gone."""
+    """A node became alive or dead."""
 
     node: str
     alive: bool
 
 
 class About(msgspec.Struct, frozen=True, kw_only=True):
-    """What a recording was made of."""
+    """The metadata of a recording."""
 
     configuration: dict[str, Any]
     models: dict[str, Any]
     versions: dict[str, str]
     utc_offset_ns: int  # UTC less CLOCK_MONOTONIC
-    restarts: int = 0  # of the recorder: the files before this one have the beginning of the drive
+    restarts: int = 0  # of the recorder: earlier files have the start of the drive
 
 
 JSON_CHANNELS: dict[str, type[msgspec.Struct]] = {
@@ -102,9 +101,9 @@ JSON_CHANNELS: dict[str, type[msgspec.Struct]] = {
 
 
 class RecordingWriter:
-    """Writes one recording. `error` is set, and all that follows thrown away, where the disk fails.
+    """Writes one recording. A disk failure sets `error`; later messages are discarded.
 
-    Times are CLOCK_MONOTONIC. Raises OSError where the file can't be made (FileExistsError where there is one).
+    Times are CLOCK_MONOTONIC. Raises OSError if the file can't be created (FileExistsError if it exists).
     """
 
     def __init__(self, path: Path, about: About, camera: Camera | None, flush_ms: float, sync: bool = True) -> None:
@@ -114,7 +113,7 @@ class RecordingWriter:
         self._flushed_ns: int | None = None
         self._file = AppendOnlyFile(path, sync)
         self._pending = _Pending()
-        # Chunks end where `flush` says, never between a record and its trace
+        # `flush` ends the chunks, never between a record and its trace
         self._writer = Writer(self._pending, chunk_size=1 << 40, compression=CompressionType.ZSTD)
         self._writer.start(profile="", library=f"birdslam {about.versions.get('birdslam', '')}".strip())
         self._writer.add_attachment(0, 0, "about.json", "application/json", msgspec.json.encode(about))
@@ -136,31 +135,31 @@ class RecordingWriter:
 
     @property
     def error(self) -> OSError | None:
-        """Why nothing more is written."""
+        """The disk error that ended the recording."""
         return self._file.error
 
     @property
     def written_bytes(self) -> int:
-        """That are in the file."""
+        """Bytes in the file."""
         return self._file.written_bytes
 
     @property
     def handed_bytes(self) -> int:
-        """That were handed to the disk; so many are written once it has caught up."""
+        """Bytes passed to the writing thread."""
         return self._pending.taken_bytes
 
     def add(self, topic: str, record: msgspec.Struct, t_ns: int, trace: Trace | None = None) -> None:
-        """A record of the bus, received at `t_ns`, and its trace where the topic has one recorded."""
+        """Adds a record of the bus, received at `t_ns`, and its trace if the topic's traces are recorded."""
         self._add(f"v1/{topic}", encode(record), t_ns)
         if topic in TRACED:
             self._add(f"v1/{topic}/trace", encode(trace or Trace()), t_ns)
 
     def begin_from(self, checkpoint: GraphCheckpoint, t_ns: int) -> None:
-        """Where a replay of this file begins."""
+        """Adds the checkpoint from which a replay of this file starts."""
         self._add(CHECKPOINT, msgspec.msgpack.encode(checkpoint), t_ns)
 
     def draw(self, channel: str, message: msgspec.Struct, t_ns: int) -> None:
-        """A message for people's tools."""
+        """Adds a message for viewers and plots."""
         self._add(channel, msgspec.json.encode(message), t_ns)
 
     def _add(self, channel: str, data: bytes, t_ns: int) -> None:
@@ -170,7 +169,7 @@ class RecordingWriter:
         self.messages += 1
 
     def flush_if_due(self, now_ns: int) -> bool:
-        """Hands what has gathered to the disk, where it is time; whether it was."""
+        """Passes the collected messages to the disk if due; returns whether they were due."""
         due = self._flushed_ns is None or now_ns - self._flushed_ns >= self._flush_ns
         if due:
             self._flushed_ns = now_ns
@@ -179,7 +178,7 @@ class RecordingWriter:
         return due
 
     def close(self, end: dict[str, str]) -> None:
-        """The rest, how it ended, and the index; waits for the disk."""
+        """Writes the rest, the metadata `end` and the index; waits for the disk."""
         self._writer.flush()
         self._writer.add_metadata("end", end)
         self._writer.finish()
@@ -188,7 +187,7 @@ class RecordingWriter:
 
 
 class _Pending(io.BytesIO):
-    """What the writer has made since it was last taken; `tell` counts from the file's beginning."""
+    """Output of the writer since the last `take`; `tell` counts from the start of the file."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -198,7 +197,7 @@ class _Pending(io.BytesIO):
         return self.taken_bytes + super().tell()
 
     def take(self) -> bytes:
-        """All of it; the file goes on behind."""
+        """Returns the collected bytes and clears the buffer."""
         piece = self.getvalue()
         self.taken_bytes += len(piece)
         self.seek(0)
@@ -207,13 +206,13 @@ class _Pending(io.BytesIO):
 
 
 def _camera_toml(camera: Camera) -> bytes:
-    """A camera file, as load_camera reads it."""
+    """Returns a camera file as load_camera reads it."""
     values = msgspec.to_builtins(camera)
     return "".join(f"{key} = {msgspec.json.encode(value).decode()}\n" for key, value in values.items()).encode()
 
 
 class Recorded(NamedTuple):
-    """One message of a recording, still as bytes."""
+    """One encoded message of a recording."""
 
     channel: str
     sequence: int
@@ -222,14 +221,14 @@ class Recorded(NamedTuple):
 
 
 class Recording:
-    """A recording to be read. Raises RecordingError where the file is none.
+    """Reads a recording. Raises RecordingError if the file is none.
 
-    After `messages` has run through, `complete` says whether the file has its end, and `damaged` how many chunks were
-    left out; `end` is what its writer said at last.
+    After a pass over `messages`: `complete` (the file has its end), `damaged` (number of skipped chunks), `end` (the
+    writer's final metadata).
     """
 
     def __init__(self, path: Path, on_read: Callable[[int], object] | None = None) -> None:
-        """`on_read` is called with the bytes of the file that have been read, again and again, for progress."""
+        """`on_read` is called repeatedly with the number of bytes read, for progress."""
         self.path = path
         self._on_read = on_read
         self.complete = False
@@ -248,10 +247,10 @@ class Recording:
             raise RecordingError(f"{self.path}: can't be read: {error.strerror}") from None
         except msgspec.DecodeError as error:
             raise RecordingError(f"{self.path}: about.json: {error}") from None
-        raise RecordingError(f"{self.path}: is no recording of BirdSLAM's")
+        raise RecordingError(f"{self.path}: is no recording of BirdSLAM")
 
     def part(self, name: str, kind: type[_Part]) -> _Part:
-        """A part of the configuration that it was recorded with, "slam.graph"; the rest may be of another version."""
+        """Returns a part of the recorded configuration, such as "slam.graph"; others may be of another version."""
         tree: Any = self.about.configuration
         try:
             for key in name.split("."):
@@ -268,7 +267,7 @@ class Recording:
         return None if self.about.configuration.get("camera") is None else self.part("camera", Camera)
 
     def _records(self) -> Iterator[Any]:
-        """All records up to the end, or to where it was cut off."""
+        """Yields all records up to the end of the file or its truncation."""
         with self.path.open("rb") as file:
             records = StreamReader(file, emit_chunks=True, record_size_limit=MAX_RECORD_BYTES).records
             while True:
@@ -281,7 +280,7 @@ class Recording:
                 yield record
 
     def messages(self, channels: Collection[str] | None = None) -> Iterator[Recorded]:
-        """Those of some channels (None: of all) in the order in which they were written."""
+        """Yields the messages of some channels (None: all) in the order of the file."""
         names: dict[int, str] = {}
         self.complete, self.damaged = False, 0
         for record in self._records():

@@ -1,4 +1,4 @@
-"""A drive in rerun (https://rerun.io): image with boxes, world, bird's-eye view, latencies; docs/recording.md.
+"""Shows a drive in rerun (https://rerun.io): image with boxes, world, bird's-eye view, latencies; docs/recording.md.
 
 Entities: `camera` and `camera/boxes`; `world/ego`, `world/path`, `world/vehicles`, `world/map` with 2-sigma ellipses;
 `bev` from above, in ego, x forward is up; `latency/*` in ms; `ego/*` speed and 1-sigma of the pose; `status`.
@@ -39,7 +39,7 @@ except ImportError as error:
     raise ConfigurationError(f"view: needs rerun: pip install 'birdslam[view]' ({error})") from None
 
 APPLICATION = "BirdSLAM"
-BLOCK_FRAMES = 100  # of path and map that are sent again as they grow; those before stay as they are
+BLOCK_FRAMES = 100  # path and map are sent in blocks; only the last block is sent again as it grows
 JPEG_QUALITY = 80
 QUEUE, IMAGES = 64, 2
 TURN_S = 0.2
@@ -48,7 +48,7 @@ READ = ("v1/frame", "v1/measurements", "v1/estimate", "v1/map", "/latency", "/ca
 
 
 class Viewer:
-    """Sends records to a rerun stream as they come; one frame is one point on its time line."""
+    """Sends records to a rerun stream; one frame is one point on its time line."""
 
     def __init__(self, stream: Any) -> None:
         self._stream = stream
@@ -62,23 +62,23 @@ class Viewer:
         self._stream.log("world", rr.ViewCoordinates.FLU, static=True)
 
     def at(self, frame_id: int, t_source_ns: int) -> None:
-        """What is logged from now on is of this frame."""
+        """Sets the frame of the next log calls."""
         self._stream.set_time("frame", sequence=frame_id)
         self._stream.set_time("drive", duration=t_source_ns / 1e9)
 
     def camera(self, camera: Camera) -> None:
-        """The calibrated camera, where it rides on the ego."""
+        """Logs the calibrated camera at its mount on the ego."""
         mount = mount_pose(camera.ground)
-        rides = rr.Transform3D(translation=mount[:3, 3], mat3x3=mount[:3, :3])
+        pose = rr.Transform3D(translation=mount[:3, 3], mat3x3=mount[:3, :3])
         size = {"width": camera.width_px, "height": camera.height_px}
-        self._stream.log("world/ego/camera", rides, rr.Pinhole(image_from_camera=camera.K, **size), static=True)
+        self._stream.log("world/ego/camera", pose, rr.Pinhole(image_from_camera=camera.K, **size), static=True)
 
     def image(self, jpeg: bytes) -> None:
-        """The frame's picture."""
+        """Logs the image of the frame."""
         self._stream.log("camera", rr.EncodedImage(contents=jpeg, media_type="image/jpeg"))
 
     def measurements(self, measurements: Measurements) -> None:
-        """Boxes in the image; what was seen of the road, from above."""
+        """Logs the boxes in the image and the lane points in the bird's-eye view."""
         if Status.END_OF_SOURCE in measurements.status:
             return
         self.at(measurements.frame_id, measurements.t_source_ns)
@@ -93,7 +93,7 @@ class Viewer:
         self._stream.log("bev/lanes", rr.Points2D(_above(lanes), radii=0.15, colors=ROAD))
 
     def estimate(self, estimate: Estimate) -> None:
-        """Where everybody is."""
+        """Logs the poses of the ego and all road users."""
         if Status.END_OF_SOURCE in estimate.status:
             return
         self.at(estimate.frame_id, estimate.t_source_ns)
@@ -107,19 +107,19 @@ class Viewer:
         self._path.append(tuple(T_world_ego[:3, 3].tolist()))
         self._stream.log(f"world/path/{self._block}", rr.LineStrips3D([self._path], colors=EGO))
         self._vehicles(estimate.road_users)
-        self._from_above(estimate)
+        self._bird_eye_view(estimate)
         self._plots(estimate)
         self._last = estimate
 
     def latency(self, latency: Latency) -> None:
-        """Where the time of the frame went."""
+        """Logs the latencies of the frame."""
         self._stream.set_time("frame", sequence=latency.frame_id)
         for name, ms in (("age", latency.age_ms), ("left", latency.left_ms), *latency.stages_ms.items()):
             if ms is not None:
                 self._stream.log(f"latency/{key_of(name)}", rr.Scalars(ms))
 
     def map(self, update: MapUpdate) -> None:
-        """What the map gained."""
+        """Logs the new points of the map."""
         if update.epoch != self._epoch:
             return
         self._grow(update.frame_id)
@@ -127,9 +127,9 @@ class Viewer:
         self._stream.log(f"world/map/{self._block}", rr.Points3D(self._points, radii=0.1, colors=ROAD))
 
     def _begin(self, estimate: Estimate) -> None:
-        """A new world: nothing of the old one is where it was."""
+        """Clears the world for a new epoch."""
         self._stream.log("world", rr.Clear(recursive=True))
-        self._stream.log("status", rr.TextLog(f"epoch {estimate.epoch} begins", level="WARN"))
+        self._stream.log("status", rr.TextLog(f"epoch {estimate.epoch} starts", level="WARN"))
         self._epoch, self._block, self._last = estimate.epoch, -1, None
         self._path, self._points = [], []
 
@@ -151,7 +151,7 @@ class Viewer:
         boxes = rr.Boxes3D(
             centers=centers,
             sizes=[(v.length_m, v.width_m, height_m) for v, height_m in zip(vehicles, heights, strict=True)],
-            quaternions=[_turned(v.T_world_vehicle.yaw_rad) for v in vehicles],
+            quaternions=[_yaw_quaternion(v.T_world_vehicle.yaw_rad) for v in vehicles],
             labels=[f"{v.label} {v.vehicle}  {mps:.1f} m/s" for v, mps in zip(vehicles, speeds_mps, strict=True)],
             colors=colors,
         )
@@ -167,7 +167,7 @@ class Viewer:
         strips = [np.column_stack([loop, np.full(len(loop), self._height_m)]) for loop in loops]
         return rr.LineStrips3D(strips, colors=color)
 
-    def _from_above(self, estimate: Estimate) -> None:
+    def _bird_eye_view(self, estimate: Estimate) -> None:
         T_ego_world = estimate.T_world_ego.inverse()
         footprints, ellipses = [_footprint(SE2(), 4.0, 1.7)], []
         for vehicle in estimate.road_users:
@@ -195,14 +195,14 @@ class Viewer:
             self._stream.log(f"ego/sigma_{name}", rr.Scalars(math.sqrt(max(variance, 0.0))))
         if self._last is None or estimate.speed_sources != self._last.speed_sources:
             sources = " and ".join(estimate.speed_sources) or "nothing yet"
-            self._stream.log("status", rr.TextLog(f"metres from {sources}", level="INFO"))
+            self._stream.log("status", rr.TextLog(f"scale from {sources}", level="INFO"))
         if estimate.status or not estimate.valid:
             text = f"{'' if estimate.valid else 'NOT VALID '}{' '.join(estimate.status)}"
             self._stream.log("status", rr.TextLog(text, level="INFO" if estimate.valid else "WARN"))
 
 
-def _turned(yaw_rad: float) -> tuple[float, float, float, float]:
-    """As a quaternion x, y, z, w."""
+def _yaw_quaternion(yaw_rad: float) -> tuple[float, float, float, float]:
+    """Returns the quaternion (x, y, z, w) of a yaw."""
     return 0.0, 0.0, math.sin(yaw_rad / 2.0), math.cos(yaw_rad / 2.0)
 
 
@@ -212,7 +212,7 @@ def _footprint(T_ego_body: SE2, length_m: float, width_m: float) -> Floats:
 
 
 def _above(points_m: Floats) -> Floats:
-    """Points of ego on a picture in which x, forward, is up and y, left, is left."""
+    """Returns points of ego in image axes: x (forward) up, y (left) left."""
     return np.column_stack([-points_m[:, 1], -points_m[:, 0]])
 
 
@@ -232,7 +232,7 @@ def _blueprint() -> Any:
 
 
 def _stream(to: Path | str | None) -> Any:
-    """Where it goes: a file, a server, or the viewer, which is started. Raises ConfigurationError where none can be."""
+    """Opens a stream to a file, a server, or a new viewer. Raises ConfigurationError if that fails."""
     stream = rr.RecordingStream(APPLICATION)
     try:
         if isinstance(to, str):
@@ -255,7 +255,7 @@ def show_recording(recording: Recording, to: Path | str | None) -> None:
 
 
 def send_recording(recording: Recording, viewer: Viewer) -> None:
-    """Sends all of a recording."""
+    """Sends all messages of a recording."""
     if recording.camera is not None:
         viewer.camera(recording.camera)
     for message in recording.messages(READ):
@@ -275,11 +275,11 @@ def send_recording(recording: Recording, viewer: Viewer) -> None:
 
 
 def show_live(vehicle: str, runtime_dir: Path | None, to: Path | str | None, seconds: float | None) -> bool:
-    """What goes on now, until the source ends, or for some seconds; gives whether anything came."""
+    """Shows a running drive until its source ends, or for some seconds; returns whether it received an estimate."""
     stream = _stream(to)
     viewer = Viewer(stream)
     with Bus(vehicle, f"view-{os.getpid()}", runtime_dir=runtime_dir) as bus:
-        _ask_camera(bus, viewer)
+        _query_camera(bus, viewer)
         seen = False
         for record in _live_records(bus, FrameReader(ring_path(vehicle, runtime_dir)), seconds):
             if isinstance(record, bytes):
@@ -300,8 +300,8 @@ def show_live(vehicle: str, runtime_dir: Path | None, to: Path | str | None, sec
     return seen
 
 
-def _ask_camera(bus: Bus, viewer: Viewer) -> None:
-    """The camera of the run, where it answers."""
+def _query_camera(bus: Bus, viewer: Viewer) -> None:
+    """Logs the camera of the run, if the query is answered."""
     try:
         for configuration in bus.query("configuration"):
             viewer.camera(msgspec.convert(configuration["camera"], Camera))

@@ -1,8 +1,7 @@
-"""rerun's viewer for a browser, on this computer alone: `birdslam view ... --web`.
+"""rerun's viewer in a browser, local to this computer: `birdslam view ... --web`.
 
-A server of rerun's own, a process that ends with us, keeps the newest of what is sent to it for browsers that come
-later. The viewer goes through a server of ours, which adds a content security policy: left to itself rerun's page asks
-its makers' servers, for fonts and newer releases and to tell of its use. All is at 127.0.0.1 and nowhere else.
+A rerun server process keeps the newest data for browsers. A proxy adds a content security policy, since rerun's page
+would contact external servers for fonts, updates and telemetry. Both listen on 127.0.0.1 only.
 """
 
 from __future__ import annotations
@@ -25,9 +24,9 @@ except ImportError as error:
     raise ConfigurationError(f"view: needs rerun: pip install 'birdslam[view]' ({error})") from None
 
 LOOPBACK = "127.0.0.1"
-KEPT = "512MiB"  # of data, the newest
-BEGIN_S, AGAIN_S = 30.0, 0.05
-# The page runs its own scripts and compiled code, and speaks with this computer
+MEMORY_LIMIT = "512MiB"  # of the newest data
+START_TIMEOUT_S, RETRY_S = 30.0, 0.05
+# The page may run its own scripts and WebAssembly, and connect to this computer
 POLICY = (
     "default-src 'self' data: blob:; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob:; "
     f"style-src 'self' 'unsafe-inline'; connect-src 'self' data: blob: http://{LOOPBACK}:*"
@@ -35,7 +34,7 @@ POLICY = (
 
 
 class _Page(ThreadingHTTPServer):
-    """rerun's page with the policy."""
+    """The proxy server of rerun's page."""
 
     daemon_threads = True
 
@@ -48,8 +47,8 @@ class _Handler(BaseHTTPRequestHandler):
     server: _Page
 
     def do_GET(self) -> None:
-        """What rerun's server says, with the policy."""
-        connection = http.client.HTTPConnection(LOOPBACK, self.server.viewer_port, timeout=BEGIN_S)
+        """Forwards the response of rerun's server with the policy."""
+        connection = http.client.HTTPConnection(LOOPBACK, self.server.viewer_port, timeout=START_TIMEOUT_S)
         try:
             connection.request("GET", self.path)
             answer = connection.getresponse()
@@ -69,11 +68,11 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, format: str, *values: object) -> None:
-        """Says nothing of what is asked."""
+        """Does not log requests."""
 
 
 class WebViewer(Closing):
-    """A context manager. Raises ConfigurationError where it can't be served at this port."""
+    """Serves the viewer; a context manager. Raises ConfigurationError if the port is not available."""
 
     def __init__(self, port: int) -> None:
         data_port, viewer_port = _free(0), _free(0)
@@ -82,11 +81,11 @@ class WebViewer(Closing):
         except (OSError, OverflowError) as error:
             raise ConfigurationError(f"view: --web {port}: {error}") from None
         threading.Thread(target=self._page.serve_forever, name="web", daemon=True).start()
-        self.data = f"rerun+http://{LOOPBACK}:{data_port}/proxy"  # where a stream is sent to
+        self.data = f"rerun+http://{LOOPBACK}:{data_port}/proxy"  # target of the stream
         self.page = f"http://{LOOPBACK}:{self._page.server_port}/?url={quote(self.data, safe='')}"
         ports = ("--port", str(data_port), "--web-viewer-port", str(viewer_port))
         program = Path(rerun_cli.__file__).with_name("rerun")  # without its wrapper, which would outlive it
-        command = [str(program), "--serve-web", "--bind", LOOPBACK, *ports, "--server-memory-limit", KEPT]
+        command = [str(program), "--serve-web", "--bind", LOOPBACK, *ports, "--server-memory-limit", MEMORY_LIMIT]
         self._process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
         try:
             self._wait_for(viewer_port)
@@ -96,25 +95,25 @@ class WebViewer(Closing):
             raise
 
     def _wait_for(self, port: int) -> None:
-        until_s = time.monotonic() + BEGIN_S
+        until_s = time.monotonic() + START_TIMEOUT_S
         while True:
             if self._process.poll() is not None or time.monotonic() > until_s:
                 self._process.kill()
-                said = self._process.communicate()[1].decode(errors="replace").strip()
-                raise ConfigurationError(f"view: --web: nothing is served at {LOOPBACK}:{port}: {said[-500:]}")
+                output = self._process.communicate()[1].decode(errors="replace").strip()
+                raise ConfigurationError(f"view: --web: no server at {LOOPBACK}:{port}: {output[-500:]}")
             try:
                 socket.create_connection((LOOPBACK, port), timeout=1.0).close()
             except OSError:
-                time.sleep(AGAIN_S)
+                time.sleep(RETRY_S)
             else:
                 return
 
     def wait(self) -> None:
-        """Until it ends, as by Ctrl-C."""
+        """Waits for the end of the server, for example by Ctrl-C."""
         self._process.communicate()
 
     def close(self) -> None:
-        """Ends it."""
+        """Ends both servers."""
         self._page.shutdown()
         self._page.server_close()
         self._process.terminate()
@@ -122,7 +121,7 @@ class WebViewer(Closing):
 
 
 def _free(port: int) -> int:
-    """A port of this computer; 0: any."""
+    """Returns a free port of this computer; 0: any."""
     with socket.socket() as holder:
         holder.bind((LOOPBACK, port))
         taken: int = holder.getsockname()[1]

@@ -1,4 +1,4 @@
-"""A recording as a ROS 2 bag."""
+"""Exports a recording as a ROS 2 bag."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from birdslam.types import EgoEdge, Estimate, MapUpdate
 
 
 def write_bag(recording: Recording, directory: Path, storage: Storage) -> int:
-    """Writes the bag into a new directory, stored as "mcap" or "sqlite3"; gives how many frames it has.
+    """Writes the bag into a new directory, stored as "mcap" or "sqlite3"; returns the number of frames.
 
     Raises BagError, and RecordingError for a recording without a camera or an estimate.
     """
@@ -45,21 +45,21 @@ def write_bag(recording: Recording, directory: Path, storage: Storage) -> int:
             for topic, message in sent:
                 bag.write(topic, message, t_ns)
         if not frames:
-            raise RecordingError(f"{recording.path}: holds no estimate")
+            raise RecordingError(f"{recording.path}: has no estimate")
         for topic, message in messages.path():
             bag.write(topic, message, t_ns)
     return frames
 
 
 class _MapPoses:
-    """A recording's poses in the map, frame by frame."""
+    """Iterates over a recording's poses in the map."""
 
     def __init__(self, recording: Recording) -> None:
         self._rest = (msgspec.json.decode(one.data, type=MapPose) for one in recording.messages(("/map_pose",)))
         self._next = next(self._rest, None)
 
     def until(self, frame_id: int) -> Iterator[MapPose]:
-        """Those up to a frame that were not given yet."""
+        """Yields the remaining poses up to a frame."""
         while self._next is not None and self._next.frame_id <= frame_id:
             yield self._next
             self._next = next(self._rest, None)

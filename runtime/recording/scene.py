@@ -1,6 +1,6 @@
-"""The records of a drive as messages that Foxglove draws.
+"""Converts the records of a drive to messages that Foxglove draws.
 
-Frames: `world` (of the epoch at hand), `ego`, `camera`; z is up in the first two, as everywhere in types.py.
+Frames: `world` (of the current epoch), `ego`, `camera`; z is up in the first two, as in types.py.
 """
 
 from __future__ import annotations
@@ -58,12 +58,12 @@ from birdslam.types import (
     VehicleEstimate,
 )
 
-VEHICLE_HEIGHT_M = 1.5  # drawn; no height is estimated
+VEHICLE_HEIGHT_M = 1.5  # drawn if no height is estimated
 ELLIPSE_POINTS = 24
-_BOXES_STAY_FRAMES = 8  # after the last look: a quarter of a second at 33 Hz
+_BOXES_STAY_FRAMES = 8  # after the last detection: a quarter of a second at 33 Hz
 EGO, VEHICLE, UNSEEN = Color(0.1, 0.4, 0.9), Color(0.9, 0.4, 0.1), Color(0.6, 0.6, 0.6)
 WHITE_LINE, YELLOW_LINE, OWN_LANE = Color(1.0, 1.0, 1.0), Color(1.0, 0.8, 0.1), Color(0.3, 0.7, 0.4)
-LINE_STEP_M = 2.0  # from point to point of a line
+LINE_STEP_M = 2.0  # between points of a line
 
 CHANNELS: dict[str, type[msgspec.Struct]] = {
     "/tf": FrameTransform,
@@ -80,13 +80,13 @@ Drawn = tuple[str, msgspec.Struct]  # channel, message
 
 
 def timestamp(t_ns: int) -> Time:
-    """Nanoseconds since 1970."""
+    """Converts nanoseconds since 1970."""
     sec, nsec = divmod(max(t_ns, 0), NS_PER_S)
     return Time(sec, nsec)
 
 
 def from_estimate(estimate: Estimate, t_ns: int) -> Iterator[Drawn]:
-    """Where everybody is; the ellipses are of 2 sigma."""
+    """Yields the poses of the ego and all road users, with 2-sigma ellipses."""
     t, T_world_ego = timestamp(t_ns), ego_pose(estimate.T_world_ego, estimate.attitude)
     at = _pose(T_world_ego)
     yield (
@@ -107,14 +107,14 @@ def from_estimate(estimate: Estimate, t_ns: int) -> Iterator[Drawn]:
 
 
 def curve_points(curve: LaneLine | Lane) -> Floats:
-    """(N, 2) in ego: a line, or a lane's centre line, as far as it is known."""
+    """Returns points (N, 2) in ego of a line or a lane's centre line, up to its known end."""
     x = np.arange(0.0, max(curve.to_m, 0.0) + LINE_STEP_M, LINE_STEP_M)
     a, h, c, d = curve.offset_m, curve.slope, curve.curvature_per_m, curve.curvature_rate_per_m2
     return np.column_stack([x, a + x * (h + x * (c / 2.0 + x * d / 6.0))])
 
 
 def _lanes(lanes: Lanes, t: Time) -> SceneEntity:
-    """Lines in their colours, edges of the road in grey, the middle of the ego's lane in green."""
+    """Draws lines in their colours, road edges in grey, the centre line of the ego's lane in green."""
     strips = []
     for line in lanes.lines:
         painted = YELLOW_LINE if line.colour is LineColour.YELLOW else WHITE_LINE
@@ -129,13 +129,13 @@ def _lanes(lanes: Lanes, t: Time) -> SceneEntity:
 
 
 def between_looks(measurements: Measurements) -> bool:
-    """Whether the boxes of the last look are still worth showing: the detector has not run on this frame."""
+    """Whether the detector has not run on this frame and the boxes of its last run are still shown."""
     carried = Status.DETECTIONS_CARRIED in measurements.status and not measurements.cv
     return carried and measurements.ages.get("detector", _BOXES_STAY_FRAMES + 1) <= _BOXES_STAY_FRAMES
 
 
 def from_measurements(measurements: Measurements, t_ns: int) -> Iterator[Drawn]:
-    """The boxes in the image, and what was seen of the road in this frame, in ego. Between two looks boxes stay."""
+    """Yields the boxes in the image and the points on the road in ego; boxes stay between two runs of the detector."""
     t = timestamp(t_ns)
     if not between_looks(measurements):
         yield "/camera/boxes", _boxes(measurements, t)
@@ -163,14 +163,14 @@ def _boxes(measurements: Measurements, t: Time) -> ImageAnnotations:
 
 
 def from_map(update: MapUpdate, t_ns: int) -> Iterator[Drawn]:
-    """What the map gained, in world."""
+    """Yields the new points of the map, in world."""
     points = [*update.landmarks_m, *update.lanes_m]
     if points:
         yield "/map", PointCloud(timestamp=timestamp(t_ns), frame_id="world", data=_packed(points))
 
 
 def from_camera(camera: Camera, t_ns: int) -> Iterator[Drawn]:
-    """The calibrated camera over the road; images are recorded without their distortion."""
+    """Yields calibration and mount of the camera; recorded images are undistorted."""
     t, mount = timestamp(t_ns), _pose(mount_pose(camera.ground))
     K = tuple(camera.K.ravel().tolist())
     P = tuple(np.hstack([camera.K, np.zeros((3, 1))]).ravel().tolist())
@@ -192,14 +192,14 @@ def from_camera(camera: Camera, t_ns: int) -> Iterator[Drawn]:
 
 
 def from_image(image: NDArray[np.uint8], jpeg_quality: int, t_ns: int) -> Drawn:
-    """An image (H, W) grey or (H, W, 3) BGR as JPEG."""
+    """Encodes an image, (H, W) grey or (H, W, 3) BGR, as JPEG."""
     _, jpeg = cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, jpeg_quality))
     data = jpeg.tobytes()
     return "/camera/image", CompressedImage(timestamp=timestamp(t_ns), frame_id="camera", data=data, format="jpeg")
 
 
 def ellipse(T_world_body: SE2, cov: tuple[float, ...], sigmas: float = 2.0) -> Floats:
-    """(ELLIPSE_POINTS, 2) in world: where the body lies, by its covariance in the tangent at its pose."""
+    """Returns the position's error ellipse (ELLIPSE_POINTS, 2) in world; `cov` is in the tangent at the pose."""
     place = np.array(cov).reshape(3, 3)[:2, :2]
     spread, axes = np.linalg.eigh((place + place.T) / 2.0)
     angle = np.linspace(0.0, 2.0 * math.pi, ELLIPSE_POINTS, endpoint=False)

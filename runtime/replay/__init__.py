@@ -1,4 +1,1 @@
-"""A recording's measurements through the back end again, and a comparison with what was recorded.
-
-Read `replay` first; `verdict` says what a comparison came to, `report` prints it.
-"""
+"""Replays recorded measurements through the back end and compares the estimates (`replay`, `verdict`, `report`)."""

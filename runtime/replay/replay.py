@@ -1,11 +1,8 @@
-"""A recording's measurements through the back end alone, without a network or a camera.
+"""Replays recorded measurements through the back end alone: `compare` with the recording, or `estimates`.
 
-`compare` gives the recorded estimates bit for bit, or the first that differs: each estimate bears the trace of the
-message that it answers, so the order is known. Measurements without an estimate either did not reach the optimizer, or
-their estimate was lost, perhaps the first of an epoch. After a restart the optimizer began a new epoch, or went on from
-its last checkpoint, as a rule with the measurements since: where it did not get them, or where the recording lacks
-measurements that it had, nothing is compared until a new epoch begins. A file that begins in the middle of a drive has
-the graph of its first frame. `estimates` replays with another configuration.
+The trace of each estimate names its measurements. Measurements without an estimate were not received by the optimizer,
+or their estimate was lost. After a restart the optimizer started a new epoch or continued from its checkpoint. If the
+recording lacks measurements that it had, comparison stops until the next epoch.
 """
 
 from __future__ import annotations
@@ -31,8 +28,8 @@ from birdslam.runtime.wire import Trace, WireError, decode, encode
 from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, Status
 
 BackEnd = tuple[GraphConfig, WeightsConfig]
-PATIENCE = 64  # estimates that wait for measurements, or a frame, which were written after them
-KEPT_FRAMES = 256  # references of frames, for those that the optimizer coasted over
+MAX_WAITING = 64  # estimates that wait for measurements, or a frame, written after them
+MAX_FRAMES = 256  # stored frame references, for frames that the optimizer predicted
 COMPARED = (
     *("v1/frame", "v1/measurements", "v1/measurements/trace", "v1/estimate", "v1/estimate/trace"),
     *("v1/map", "/alive"),
@@ -46,15 +43,15 @@ class _Message(msgspec.Struct):
 
 @dataclass
 class _State:
-    """The optimizer, as far as estimates follow from it."""
+    """The state of the optimizer that determines its estimates."""
 
     graph: PoseGraph
-    last: Estimate | None = None  # that rests on measurements
+    last: Estimate | None = None  # from measurements
     unreported: tuple[Status, ...] = ()
     maps: list[MapUpdate] = field(default_factory=list)
 
     def measure(self, measurements: Measurements) -> Estimate:
-        """One frame's, as OptimizeNode.step."""
+        """Returns the estimate of a frame, as OptimizeNode.step does."""
         if Status.END_OF_SOURCE in measurements.status:
             return end_estimate(measurements, self.graph.epoch, self.last)
         self.last = self.graph.optimise(measurements)
@@ -63,13 +60,13 @@ class _State:
         return self.last
 
     def report(self, estimate: Estimate) -> Estimate:
-        """With the statuses that had not been reported yet."""
+        """Returns the estimate with the unreported statuses."""
         reported, self.unreported = with_unreported(estimate, self.unreported), ()
         return reported
 
 
 class Comparison:
-    """Goes through a recording once."""
+    """Compares a recording with its replay in one pass."""
 
     def __init__(self, recording: Recording) -> None:
         self.verdict = Verdict()
@@ -81,17 +78,17 @@ class Comparison:
         self._estimates: deque[_Message] = deque()
         self._frames: dict[int, FrameRef] = {}
         self._maps: dict[int, MapUpdate] = {}
-        self._alive = 0  # how often the optimizer came
+        self._alive = 0  # number of starts of the optimizer
         self._checkpoint = _checkpoint(recording)
-        self._since: list[Measurements] = []  # after it, for the first estimate that can be compared
+        self._since: list[Measurements] = []  # measurements after it, for the first comparable estimate
         self._epoch: int | None = None
-        self._number = 0  # of the last estimate among its process's
-        self._alive_before = 0  # and how often the optimizer had come then
-        self._lost = False  # estimates between the last one and this
+        self._number = 0  # of the last estimate, counted per process
+        self._alive_before = 0  # starts of the optimizer at the last estimate
+        self._lost = False  # whether estimates before this one were lost
         self._reported_frame = -1
 
     def run(self) -> Verdict:
-        """Raises RecordingError where the recording holds something that is no record."""
+        """Returns the verdict. Raises RecordingError for an invalid record."""
         data = b""
         for message in self._recording.messages(COMPARED):
             if message.channel in ("v1/measurements", "v1/estimate"):
@@ -103,24 +100,24 @@ class Comparison:
             elif message.channel == "v1/frame":
                 ref = _record(message.data, FrameRef)
                 self._frames[ref.frame_id] = ref
-                if len(self._frames) > KEPT_FRAMES:
+                if len(self._frames) > MAX_FRAMES:
                     del self._frames[next(iter(self._frames))]
             elif message.channel == "v1/map":
                 self._compare_map(_record(message.data, MapUpdate))
             else:
                 event = msgspec.json.decode(message.data, type=Alive)
                 self._alive += event.alive and event.node == "optimize"
-            self._answer(PATIENCE)
+            self._compare_estimates(MAX_WAITING)
             if self.verdict.difference is not None:
                 return self.verdict
         if not self._recording.complete:
             self._drop_open_end()
-        self._answer(0)
+        self._compare_estimates(0)
         self.verdict.open_end += len(self._measurements)
         return self.verdict
 
     def _drop_open_end(self) -> None:
-        """A file that was cut off may have lost the measurements behind its last estimates, which came first."""
+        """Removes the last estimates of a truncated file whose measurements are lost."""
         recorded = [m.trace.stages for m in self._measurements]
         while self._estimates:
             cause = self._estimates[-1].trace.stages[:-1]
@@ -129,8 +126,8 @@ class Comparison:
             self._estimates.pop()
             self.verdict.open_end += 1
 
-    def _answer(self, patience: int) -> None:
-        """Replays the estimates whose measurements or frame are there; more than `patience` do not wait for theirs."""
+    def _compare_estimates(self, max_waiting: int) -> None:
+        """Replays the estimates whose measurements or frame are read; at most `max_waiting` wait for theirs."""
         while self._estimates and self.verdict.difference is None:
             message = self._estimates[0]
             cause = message.trace.stages[:-1]
@@ -138,7 +135,7 @@ class Comparison:
             place = next((i for i, m in enumerate(self._measurements) if m.trace.stages == cause), None)
             estimate = _record(message.data, Estimate)
             missing = place is None if by_measurements else estimate.frame_id not in self._frames
-            if missing and len(self._estimates) <= patience:
+            if missing and len(self._estimates) <= max_waiting:
                 return
             self._estimates.popleft()
             self.verdict.epochs += estimate.epoch != self._epoch
@@ -152,7 +149,7 @@ class Comparison:
                 for _ in range(taken):
                     self._measurements.popleft()
                 self.verdict.unanswered += taken
-            elif place is None:  # the optimizer had measurements that the recording has not
+            elif place is None:  # the recording lacks measurements of the optimizer
                 self._state = None
                 self.verdict.unknown += 1
             else:
@@ -162,9 +159,9 @@ class Comparison:
             self._reported_frame = max(self._reported_frame, estimate.frame_id)
 
     def _replay(self, estimate: Estimate, data: bytes, open_: list[Measurements], answered: Measurements | None) -> int:
-        """One estimate by each of the ways in which it may have come about; shown is the last, where none gives it.
+        """Replays one estimate under each hypothesis about the optimizer; the difference to the last one is reported.
 
-        Returns how many of the measurements `open_` it rests on.
+        Returns how many of the measurements `open_` it used.
         """
         likeliest: Estimate | None = None
         unseen = self._began_unseen(estimate)
@@ -181,8 +178,9 @@ class Comparison:
                 self.verdict.restarts += restarts
                 return len(given) - (answered is not None)
         now = self._state
-        behind = self._came_back and Status.GRAPH_RESTORED in estimate.status  # its checkpoint is older than that state
-        if behind:  # and it did not get what came since
+        # Its checkpoint is older than the replayed state, and it did not receive the measurements since
+        behind = self._came_back and Status.GRAPH_RESTORED in estimate.status
+        if behind:
             self.verdict.restarts += self._came_back
         if unseen or behind or (now is not None and (open_ or now.graph.epoch != estimate.epoch)):
             self._state = None
@@ -196,19 +194,17 @@ class Comparison:
 
     @property
     def _came_back(self) -> int:
-        """How often the optimizer has come back since the last estimate that was equal."""
+        """Number of restarts of the optimizer since the last equal estimate."""
         return max(0, self._alive - 1 - self.verdict.restarts)
 
     def _began_unseen(self, estimate: Estimate) -> bool:
-        """Whether this estimate's epoch began with one that the recorder never had: it was lost on its way, or the
-        process that sent it was killed meanwhile and the next one went on from its checkpoint.
-        """
+        """Whether the first estimate of this epoch was not recorded: it was lost, or its sender was killed."""
         began = self._state is not None and estimate.epoch > self._state.graph.epoch
         killed = self._came_back > 1 and Status.GRAPH_RESTORED in estimate.status
         return began and (self._lost or killed) and Status.GRAPH_RESET not in estimate.status
 
     def _reported_before(self, estimate: Estimate) -> list[Measurements]:
-        """The next measurements, of frames that were reported already: a restored graph may have them."""
+        """Returns the next measurements of already published frames, which a restored graph may contain."""
         if self._state is None or Status.GRAPH_RESTORED not in estimate.status:
             return []
         waiting = (_record(message.data, Measurements) for message in self._measurements)
@@ -217,7 +213,7 @@ class Comparison:
     def _hypotheses(
         self, estimate: Estimate, open_: list[Measurements], answered: Measurements | None
     ) -> Iterator[tuple[_State, list[Measurements], int]]:
-        """(state before, measurements given to it, how often the optimizer was restarted)."""
+        """Yields (state before, measurements added to it, number of restarts of the optimizer)."""
         now = [] if answered is None else [answered]
         new_world = Status.GRAPH_RESET in estimate.status
         checkpoint = self._checkpoint
@@ -235,12 +231,12 @@ class Comparison:
         restored = (Status.GRAPH_RESTORED,) if came_back and Status.GRAPH_RESTORED in estimate.status else ()
         if came_back and new_world:
             yield self._fresh(estimate), now, 1
-            yield self._copy(), now, 1  # from its checkpoint, which nothing ties to what perceive still had
+            yield self._copy(), now, 1  # from its checkpoint, without the retained measurements
         if restored:
             for last, given in itertools.product((self._state.last, None), ([*open_, *now], now)):
                 yield self._copy(last, restored), given, 1
         if self._began_unseen(estimate):
-            started = min(came_back, 2 if restored else 1)  # the process that began the epoch, and the one after it
+            started = min(came_back, 2 if restored else 1)  # the process that started the epoch, and its successor
             for start in range(len(open_)):
                 graph = PoseGraph(*self._back_end, estimate.epoch)
                 yield _State(graph, unreported=restored), [*open_[start:], *now], started
@@ -249,22 +245,22 @@ class Comparison:
         yield self._state, [*open_, *now], 0
 
     def _copy(self, *changed: Any) -> _State:
-        """The state at hand, so that it can be gone on from in several ways; with another `last` and `unreported`."""
+        """Copies the current state for a hypothesis, optionally with another `last` and `unreported`."""
         assert self._state is not None
         graph = PoseGraph.restore(self._state.graph.checkpoint(), *self._back_end)
         return _State(graph, *(changed or (self._state.last, self._state.unreported)))
 
     def _fresh(self, estimate: Estimate) -> _State:
-        """A new graph; its first estimate says so where planners may know an older one."""
+        """Returns a new graph, with GRAPH_RESET if the estimate has it."""
         unreported = (Status.GRAPH_RESET,) if Status.GRAPH_RESET in estimate.status else ()
         return _State(PoseGraph(*self._back_end, estimate.epoch), unreported=unreported)
 
     def _replayed(self, state: _State, given: list[Measurements], estimate: Estimate) -> Estimate | None:
-        """What comes out for the frame of `estimate`; None where it can't be known."""
+        """Returns the replayed estimate of the frame; None if it can't be determined."""
         replayed = None
         for measurements in given:
             replayed = state.measure(measurements)
-        if replayed is not None and replayed.frame_id < estimate.frame_id:  # late: a newer frame had been coasted over
+        if replayed is not None and replayed.frame_id < estimate.frame_id:  # late: a newer frame was predicted
             state.unreported = (*state.unreported, *(s for s in replayed.status if s in REPORTED_LATE))
         if replayed is None or replayed.frame_id != estimate.frame_id:
             ref = self._frames.get(estimate.frame_id)
@@ -276,8 +272,8 @@ class Comparison:
         return state.report(replayed)
 
     def _compare_map(self, recorded: MapUpdate) -> None:
-        """What the map gained with a frame that was equal must be equal too; it is written after its estimate."""
-        self._answer(PATIENCE)
+        """Compares the map update of a frame, which is written after its estimate."""
+        self._compare_estimates(MAX_WAITING)
         replayed = self._maps.pop(recorded.frame_id, None)
         if replayed is None:
             return
@@ -288,7 +284,7 @@ class Comparison:
 
 
 def _checkpoint(recording: Recording) -> GraphCheckpoint | None:
-    """The graph that a file begins with whose beginning another one has. Raises RecordingError."""
+    """Returns the graph at the start of a file without the start of its drive. Raises RecordingError."""
     if not recording.about.restarts:
         return None
     for message in recording.messages((CHECKPOINT,)):
@@ -302,17 +298,17 @@ def _checkpoint(recording: Recording) -> GraphCheckpoint | None:
 
 
 def compare(recording: Recording) -> Verdict:
-    """Whether the back end gives the recorded estimates, bit for bit."""
+    """Compares the back end's estimates with the recorded ones, bit for bit."""
     return Comparison(recording).run()
 
 
 def back_end(recording: Recording) -> BackEnd:
-    """What the graph was made with. Raises RecordingError where it is of another version."""
+    """Returns the recorded configuration of the graph. Raises RecordingError if it is of another version."""
     return recording.part("slam.graph", GraphConfig), recording.part("slam.weights", WeightsConfig)
 
 
 def estimates(recording: Recording, config: BackEnd) -> Iterator[Measurements | Estimate | MapUpdate]:
-    """The estimates of the recorded measurements by another configuration, each after its measurements."""
+    """Yields estimates and map updates of the recorded measurements with another configuration."""
     graph = PoseGraph(*config)
     for message in recording.messages(("v1/measurements",)):
         measurements = _record(message.data, Measurements)
@@ -326,7 +322,7 @@ def estimates(recording: Recording, config: BackEnd) -> Iterator[Measurements | 
 
 
 def _canonical(record: msgspec.Struct) -> bytes:
-    """The record's bytes as its receiver would encode them again."""
+    """Returns the record's bytes after decoding and encoding again."""
     return encode(decode(encode(record), type(record)))
 
 
@@ -334,4 +330,4 @@ def _record(data: bytes, kind: type[Any]) -> Any:
     try:
         return decode(data, kind)
     except WireError as error:
-        raise RecordingError(f"the recording holds no valid {kind.__name__}: {error}") from None
+        raise RecordingError(f"the recording has an invalid {kind.__name__}: {error}") from None

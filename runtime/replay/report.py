@@ -1,4 +1,4 @@
-"""The outcome of a replay for a person."""
+"""Prints the outcome of a replay."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ MAX_FIELDS = 12
 
 
 def report(verdict: Verdict, recording: Recording) -> str:
-    """The verdict for a person; where something differs, the libraries that were others then."""
+    """Returns the verdict as text; after a difference also the libraries of other versions."""
     lines = [
         f"equal bit for bit: {verdict.equal} estimates ({verdict.coasted} of them coasted), {verdict.maps} map updates",
         f"epochs: {verdict.epochs}, restarts of the optimizer: {verdict.restarts}",
@@ -19,14 +19,14 @@ def report(verdict: Verdict, recording: Recording) -> str:
     if verdict.unanswered:
         lines.append(f"measurements without an estimate: {verdict.unanswered}")
     if verdict.unknown:
-        lines.append(f"not compared, since the measurements behind them were not recorded: {verdict.unknown} estimates")
+        lines.append(f"not compared, since their measurements were not recorded: {verdict.unknown} estimates")
     if not recording.complete:
         lines.append(f"the recording was cut off: {verdict.open_end} records at its end lack their counterpart")
     if recording.damaged:
-        lines.append(f"damaged chunks left out: {recording.damaged}")
+        lines.append(f"damaged chunks skipped: {recording.damaged}")
     difference = verdict.difference
     if difference is not None:
-        lines.append(f"frame {difference.frame_id} DIFFERS, the first that does:")
+        lines.append(f"first difference: frame {difference.frame_id} DIFFERS:")
         shown = difference.fields[:MAX_FIELDS]
         lines += [f"  {where}: recorded {recorded}, replayed {replayed}" for where, recorded, replayed in shown]
         if len(difference.fields) > MAX_FIELDS:

@@ -1,4 +1,4 @@
-"""Results of a recording's measurements by the back end: trajectories, map, video, and the graph's edges as g2o."""
+"""Writes results of recorded measurements: trajectories, map, video, and the graph's edges as g2o."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def write_g2o(recording: Recording, config: BackEnd, path: Path) -> None:
 def write_results(recording: Recording, config: BackEnd, output: Path, smooth: bool, video_file: Path | None) -> None:
     """Writes the results of the recorded measurements into the folder `output`.
 
-    `smooth`: the final trajectories too. Raises RecordingError, ResultsError.
+    `smooth`: also the final trajectories. Raises RecordingError, ResultsError.
     """
     if recording.camera is None:
         raise RecordingError(f"{recording.path}: its configuration has no camera")
@@ -67,7 +67,7 @@ def write_results(recording: Recording, config: BackEnd, output: Path, smooth: b
 
 
 def changed_back_end(config: BackEnd, settings: Mapping[str, Any], constants: Mapping[str, Any]) -> BackEnd:
-    """The back end with other values: keys of users, and constants. Raises ConfigurationError for others."""
+    """Returns the back end with changed settings and constants. Raises ConfigurationError for unknown keys."""
     for key in settings:
         refuse_constant(key, "command line")
     if "method" in settings:

@@ -11,7 +11,7 @@ import msgspec
 
 @dataclass
 class Difference:
-    """The first estimate that came out otherwise."""
+    """The first estimate that differs."""
 
     frame_id: int
     fields: list[tuple[str, Any, Any]]  # where, recorded, replayed
@@ -19,26 +19,26 @@ class Difference:
 
 @dataclass
 class Verdict:
-    """Counts of what was equal, and the first difference."""
+    """Counts of equal records, and the first difference."""
 
     equal: int = 0  # estimates, bit for bit
     coasted: int = 0  # of them, without measurements
-    unknown: int = 0  # estimates that can't be compared: what they answer is not in the recording
+    unknown: int = 0  # estimates that can't be compared: their measurements are not in the recording
     unanswered: int = 0  # measurements without an estimate
     maps: int = 0  # map updates, bit for bit
     epochs: int = 0
     restarts: int = 0  # of the optimizer
     difference: Difference | None = None
-    open_end: int = 0  # at the end of a recording that was cut off: measurements or estimates without the other
+    open_end: int = 0  # at the end of a truncated recording: measurements or estimates without their counterpart
 
     @property
     def same(self) -> bool:
-        """All that can be compared is equal, and something could be."""
+        """Whether all comparable estimates are equal, and there is at least one."""
         return self.difference is None and self.equal > 0
 
 
 def differing(recorded: msgspec.Struct, replayed: msgspec.Struct) -> list[tuple[str, Any, Any]]:
-    """(where, recorded, replayed) of each number or text that is not the same."""
+    """Returns (where, recorded, replayed) of each number or text that differs."""
     return list(_walk("", msgspec.to_builtins(recorded), msgspec.to_builtins(replayed)))
 
 
