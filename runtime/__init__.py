@@ -1,5 +1,5 @@
-"""The shell around the method: three processes, the bus, the supervisor, the command line.
+"""The runtime around the method: three processes, the bus, the supervisor, the command line.
 
-Read `topology` first: every topic and every node on one screen. `nodes` is what each process does, `supervision`
-starts and watches them, `configuration` is everything that can be set. What computes stands in birdslam/.
+Read `topology` first: all topics and nodes. `nodes` has the code of each process, `supervision` starts and watches
+them, `configuration` has all settings. The computation is in birdslam/.
 """

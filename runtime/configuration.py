@@ -1,8 +1,8 @@
-"""One typed configuration for the whole system: the defaults live here and in the structs it holds.
+"""The typed configuration of the whole system, with its defaults.
 
-A TOML file holds differences only, of the keys in `runtime/keys.py` alone; the other fields are constants, which
-programs and `--constant` vary. An unknown key, a constant or a wrong type is a `ConfigurationError` that names the file
-(or the command-line option) and the key. Paths in a file are relative to that file.
+A TOML file may set the keys in `runtime/keys.py`; the other fields are constants, for programs and `--constant`. An
+unknown key, a constant or a wrong type raises a `ConfigurationError` with the file (or the option) and the key. Paths
+in a file are relative to that file.
 """
 
 from __future__ import annotations
@@ -72,13 +72,13 @@ __all__ = [
     "without_passwords",
 ]
 
-NO_MODEL = "none"  # as --model: no network but those that are named beside it, not the shipped one either
-WATCHDOG_S, LOSSLESS_WATCHDOG_S = 2.0, 60.0  # the latter where a drive may take as long as it likes, on any computer
+NO_MODEL = "none"  # value of --model: no shipped network
+WATCHDOG_S, LOSSLESS_WATCHDOG_S = 2.0, 60.0  # the latter at rate "max", on slow computers too
 _USER = re.compile(r"(?<=://)[^/@]*@")
 
 
 class ConfigurationError(ValueError):
-    """What the user asked for can't be: the message names the file or option, the key, and the reason."""
+    """The configuration is invalid; the message names the file or option, the key, and the reason."""
 
 
 class Configuration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -107,48 +107,48 @@ class Configuration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
     @property
     def lossless(self) -> bool:
-        """Every frame is processed, as fast as it can be."""
+        """Whether every frame is processed, as fast as possible."""
         return self.source.rate == "max"
 
     def as_lossless(self) -> Configuration:
-        """The same, but for `lossless`."""
+        """Returns the configuration with rate "max"."""
         return msgspec.structs.replace(self, source=msgspec.structs.replace(self.source, rate="max"))
 
     @property
     def restarts(self) -> bool:
-        """Whether a node that died is restarted."""
+        """Whether dead nodes are restarted."""
         restart = self.runtime.restart
         return not self.lossless if restart is None else restart == "always"
 
     @property
     def live(self) -> bool:
-        """Frames come from a camera, not from a file."""
+        """Whether frames come from a camera, not from a file."""
         return is_live(self.source.uri)
 
     @property
     def maps_live(self) -> bool:
-        """Whether a process localises the drive in its map while it goes on; else that is done when it is over."""
+        """Whether a process localises the drive in its map during the drive; else that is done afterwards."""
         return not self.lossless and bool(self.results.map or self.results.map_only)
 
     @property
     def spares(self) -> bool:
-        """Whether processes stand by."""
+        """Whether spare processes are kept."""
         return self.runtime.spares and self.restarts
 
     @property
     def runtime_dir(self) -> Path | None:
-        """Where sockets and locks go; None: the user's own place (runtime/transport/presence.py)."""
+        """The directory of sockets and locks; None: the user's default (runtime/transport/presence.py)."""
         return Path(self.runtime.runtime_dir) if self.runtime.runtime_dir else None
 
     @property
     def watchdog_s(self) -> float:
-        """A ready node that has shown no life for so long is stalled."""
+        """A ready node without a heartbeat for this time is stalled."""
         watchdog_ms = self.runtime.watchdog_ms
         return (LOSSLESS_WATCHDOG_S if self.lossless else WATCHDOG_S) if watchdog_ms is None else watchdog_ms / 1e3
 
     @property
     def deadline_ns(self) -> int | None:
-        """From a frame's capture on, how long it waits for networks; None: for all of them, so that a run repeats."""
+        """How long a frame waits for networks after its capture; None: without limit, for reproducible runs."""
         deadline_ms = self.perceive.deadline_ms
         return None if self.lossless or deadline_ms is None else round(deadline_ms * 1e6)
 
@@ -159,10 +159,10 @@ def load(
     models: Iterable[str] = (),
     constants: Mapping[str, Any] | None = None,
 ) -> Configuration:
-    """The configuration of a TOML file, then `overrides` ({"source.stride": 2}) on top of it.
+    """Loads the configuration of a TOML file with `overrides` ({"source.stride": 2}).
 
-    Both name keys of users alone. `models` are names of networks at hand, each for the role that its manifest states;
-    `constants` may name any field ({"slam.graph.ego_nodes": 8}). Raises ConfigurationError.
+    Both may name only keys of `runtime/keys.py`. `models`: names of installed networks, each for the role of its
+    manifest; `constants` may name any field ({"slam.graph.ego_nodes": 8}). Raises ConfigurationError.
     """
     tree: dict[str, Any] = {}
     if path is not None:
@@ -201,10 +201,7 @@ def load(
 
 
 def complete(configuration: Configuration, camera: Camera, rate_hz: float) -> Configuration:
-    """The configuration with what its source knows: the camera, and what comes of its frame rate.
-
-    That is how long a frame may wait, and on which frames each head runs.
-    """
+    """Adds the source's camera and the settings that depend on its frame rate: deadline and schedule of networks."""
     rate, perceive = configuration.source.rate, configuration.perceive
     hz = rate if isinstance(rate, float) else rate_hz
     perceive = msgspec.structs.replace(perceive, schedule=perceive.schedule.at(hz), period_ms=1e3 / hz)
@@ -215,14 +212,14 @@ def complete(configuration: Configuration, camera: Camera, rate_hz: float) -> Co
 
 
 def refuse_constant(key: str, origin: str) -> None:
-    """Raises ConfigurationError where a file or `--set` names a constant."""
+    """Raises ConfigurationError if a file or `--set` names a constant."""
     reason = why_no_key(key, Configuration)
     if reason:
         raise ConfigurationError(f"{origin}: {key}: {reason}")
 
 
 def parse_setting(text: str, option: str = "--set") -> tuple[str, Any]:
-    """KEY=VALUE of the command line; the value is TOML, or a plain string where it is none."""
+    """Parses KEY=VALUE of the command line; the value is TOML, or else a plain string."""
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
         raise ConfigurationError(f"{option} {text}: expected KEY=VALUE")
@@ -233,16 +230,16 @@ def parse_setting(text: str, option: str = "--set") -> tuple[str, Any]:
 
 
 def without_passwords(configuration: Configuration) -> Configuration:
-    """With nothing in it that lets anybody in: a camera's address may bear a password."""
+    """Removes the password from the camera's address."""
     uri = _USER.sub("", configuration.source.uri)
     scheme = scheme_of(uri, all_schemes())
-    if scheme is not None and scheme.address == "network":  # rtsp:NAME:PASSWORD@HOST works without the slashes too
+    if scheme is not None and scheme.address == "network":  # rtsp:NAME:PASSWORD@HOST is valid without slashes
         uri = f"{scheme.name}:{re.sub(r'^[^/@]*@', '', uri.removeprefix(f'{scheme.name}:'))}"
     return msgspec.structs.replace(configuration, source=msgspec.structs.replace(configuration.source, uri=uri))
 
 
 def dump(configuration: Configuration) -> dict[str, Any]:
-    """Plain JSON-able data; `msgspec.convert(dump(c), Configuration) == c`."""
+    """Returns JSON-compatible data; `msgspec.convert(dump(c), Configuration) == c`."""
     return msgspec.to_builtins(configuration)
 
 
@@ -251,13 +248,13 @@ def _put(tree: dict[str, Any], key: str, value: Any) -> None:
     for parent in parents:
         branch = tree.setdefault(parent, {})
         if not isinstance(branch, dict):
-            raise ConfigurationError(f"command line: {key}: {parent} is no table")
+            raise ConfigurationError(f"command line: {key}: {parent} is not a table")
         tree = branch
     tree[leaf] = value
 
 
 def _anchor_paths(tree: dict[str, Any], base: Path) -> None:
-    """Makes the paths of a file absolute; whatever has a wrong type is left for the validation to name."""
+    """Makes the paths of a file absolute; values of a wrong type are left to the validation."""
 
     def anchor(table: Any, *keys: str) -> None:
         for key in keys:
@@ -276,7 +273,7 @@ def _anchor_paths(tree: dict[str, Any], base: Path) -> None:
     for spec in models.values() if isinstance(models, dict) else ():
         if isinstance(spec, dict) and not model_store.is_name(str(spec.get("path", ""))):
             anchor(spec, "path")
-        if isinstance(spec, dict) and str(spec.get("manifest", "")).endswith(".toml"):  # else a shipped one's name
+        if isinstance(spec, dict) and str(spec.get("manifest", "")).endswith(".toml"):  # else the name of a shipped one
             anchor(spec, "manifest")
     anchor(tree.get("source"), "speed", "odometry", "detections")
     source = tree.get("source")
@@ -287,7 +284,7 @@ def _anchor_paths(tree: dict[str, Any], base: Path) -> None:
 
 
 def _put_models(tree: dict[str, Any], names: Iterable[str]) -> None:
-    """Adds models at hand by name, each for the role that its manifest states."""
+    """Adds installed models by name, each for the role of its manifest."""
     runtime = tree.get("runtime")
     models_dir = runtime.get("models_dir") if isinstance(runtime, dict) else None
     for name in names:
@@ -299,7 +296,7 @@ def _put_models(tree: dict[str, Any], names: Iterable[str]) -> None:
 
 
 def _with_models_found(configuration: Configuration) -> Configuration:
-    """The configuration with the files of models at hand where their names stood."""
+    """Replaces names of installed models by their files."""
     found: dict[str, ModelSpec] = {}
     models = configuration.models
     for role, spec in (*models.given().items(), *([("pointnet", models.pointnet)] if models.pointnet else [])):
@@ -316,14 +313,14 @@ def _read_camera_file(tree: dict[str, Any]) -> None:
     camera, pinned = tree.get("camera"), tree.get("camera_sha256")
     if not isinstance(camera, str):
         if pinned:
-            raise ConfigurationError("camera_sha256: there is no camera file that it could pin")
+            raise ConfigurationError("camera_sha256: there is no camera file")
         return
     try:
         found = hashlib.sha256(Path(camera).read_bytes()).hexdigest() if pinned else pinned
     except OSError as error:
         raise ConfigurationError(f"{camera}: {error.strerror}") from error
     if found != pinned:
-        raise ConfigurationError(f"{camera}: its sha256 is {found}, camera_sha256 pins {pinned}: look what has changed")
+        raise ConfigurationError(f"{camera}: its sha256 is {found}, but camera_sha256 is {pinned}")
     try:
         tree["camera"] = msgspec.to_builtins(load_camera(Path(camera)))
     except DatasetError as error:
@@ -331,7 +328,7 @@ def _read_camera_file(tree: dict[str, Any]) -> None:
 
 
 def _explain(message: str) -> tuple[str, str]:
-    """The key and the reason in a message of msgspec."""
+    """Returns the key and the reason in a message of msgspec."""
     match = re.fullmatch(r"(.*) - at `(?:key in )?\$\.?(.*)`", message, re.DOTALL)
     reason, key = match.groups() if match else (message, "")
     unknown = re.fullmatch(r"Object contains unknown field `(.*)`", reason)
@@ -339,7 +336,7 @@ def _explain(message: str) -> tuple[str, str]:
         table = f"{key}.".lstrip(".")
         inside = (field.key.removeprefix(table) for field in fields(Configuration) if field.key.startswith(table))
         near = difflib.get_close_matches(unknown[1], sorted({rest.partition(".")[0] for rest in inside}), 1)
-        return f"{table}{unknown[1]}", "there is no such key" + "".join(f"; the nearest is {table}{n}" for n in near)
+        return f"{table}{unknown[1]}", "no such key" + "".join(f"; the nearest is {table}{n}" for n in near)
     return key or "configuration", reason
 
 

@@ -1,4 +1,4 @@
-"""Writes the files that install the service on a vehicle computer: deploy/install.sh needs no checkout."""
+"""Writes the files that install the service on a vehicle computer without a checkout."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from pathlib import Path
 
 from birdslam.runtime.configuration import ConfigurationError
 
-SOURCE = Path(__file__).resolve().parents[1]  # deploy/ and configs/ lie beside runtime/, in the checkout and installed
-PACKAGE = "package"  # the file that names what install.sh hands to pip
+SOURCE = Path(__file__).resolve().parents[1]  # deploy/ and configs/ are beside runtime/
+PACKAGE = "package"  # file with the requirement for pip, read by install.sh
 
 
 def write_deployment(target: Path) -> Path:
     """Writes the new folder `target` and returns its folder `deploy`. Raises ConfigurationError."""
     if target.exists():
-        raise ConfigurationError(f"{target}: exists already; name a new folder")
+        raise ConfigurationError(f"{target}: exists; name a new folder")
     deploy, configs = target / "deploy", target / "configs"
     try:
         for folder in (deploy, configs):

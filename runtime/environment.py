@@ -1,31 +1,29 @@
-"""The environment that every process computes in, and the exit statuses of programs and nodes.
+"""The environment variables of every process, and the exit statuses of programs and nodes.
 
-Imports nothing: numpy's libraries read the environment when they are loaded.
+Imports nothing, since numpy's libraries read the environment when they are loaded.
 """
 
-# One thread for BLAS and OpenMP in every process: DESIGN.md measured 100 times the latency with more on busy cores.
-# In `evaluate` too, which must compute as the nodes do.
+# One thread for BLAS and OpenMP in every process, since more raise the latency on busy cores
 ENVIRONMENT = {
     **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1"),
-    "OPENCV_FFMPEG_LOGLEVEL": "-8",  # FFmpeg prints every damaged block of a film; a status reports the frame
-    "ORT_DISABLE_TELEMETRY": "1",  # onnxruntime's wheels come with it on
-    # glibc: what a frame's images leave is for those of the next, in place of going back to the kernel, which hands out
-    # each page again with a fault (docs/deployment.md)
-    "MALLOC_MMAP_THRESHOLD_": str(32 << 20),  # the most that it takes
+    "OPENCV_FFMPEG_LOGLEVEL": "-8",  # FFmpeg logs every damaged block; a status reports the frame
+    "ORT_DISABLE_TELEMETRY": "1",
+    # glibc keeps the memory of a frame's images for the next frame, which avoids page faults (docs/deployment.md)
+    "MALLOC_MMAP_THRESHOLD_": str(32 << 20),  # its maximum
     "MALLOC_TRIM_THRESHOLD_": str(1 << 32),
     "MALLOC_TOP_PAD_": str(16 << 20),
-    "MALLOC_ARENA_MAX": "1",  # of one heap for all threads, whatever thread an image is made in
+    "MALLOC_ARENA_MAX": "1",  # one heap for all threads
 }
-USER_ERROR_STATUS = 2  # of the program and of a node: what the user gave can't be used
+USER_ERROR_STATUS = 2  # of the program and of a node: invalid input
 INTERRUPTED_STATUS = 130
 CLOSED_PIPE_STATUS = 141
-# Whose versions a run writes down
+# Their versions are in the summary of a run
 LIBRARIES = ("birdslam", "numpy", "opencv-python-headless", "onnxruntime", "gtsam", "eclipse-zenoh")
 ONNXRUNTIMES = ("onnxruntime", "onnxruntime-openvino", "onnxruntime-gpu")  # packages of the same library
 
 
 def library_versions() -> dict[str, str]:
-    """Python's, and those of LIBRARIES."""
+    """Returns the versions of Python and LIBRARIES."""
     import platform
     from importlib.metadata import PackageNotFoundError, version
 

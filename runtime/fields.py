@@ -1,6 +1,6 @@
-"""Every field of the typed configuration, by its key: what a file's keys and `--constant` are held to.
+"""The fields of the typed configuration by key, for the checks of a file's keys and `--constant`.
 
-A table for each name ("vehicles.car") counts once, as NAME.
+A table per name ("vehicles.car") has the key NAME.
 """
 
 from __future__ import annotations
@@ -24,27 +24,27 @@ class Field:
     """One value of the configuration."""
 
     key: str  # slam.graph.ego_nodes
-    struct: type[msgspec.Struct]  # the table that it is in: GraphConfig
+    struct: type[msgspec.Struct]  # its table: GraphConfig
     kind: kinds.Type
-    default: Any  # msgspec.NODEFAULT: required; ByName where it differs from name to name
+    default: Any  # msgspec.NODEFAULT: required; ByName: one per name
 
     @property
     def name(self) -> str:
-        """Of the struct's field."""
+        """The name of the struct's field."""
         return self.key.rpartition(".")[2]
 
     @property
     def place(self) -> str:
-        """Where the code states it: "GraphConfig in birdslam/graph/graph_config.py"."""
+        """The place of its definition: "GraphConfig in birdslam/graph/graph_config.py"."""
         return f"{self.struct.__name__} in {self.struct.__module__.replace('.', '/')}.py"
 
 
 class ByName(dict[str, Any]):
-    """Defaults that differ from name to name."""
+    """Defaults per name."""
 
 
 def fields(struct: type[msgspec.Struct], default: Any = None, prefix: str = "") -> Iterator[Field]:
-    """Those of a struct and of the structs within it, outer ones first. `default` is an instance, or None."""
+    """Yields the fields of a struct and of its nested structs, outer ones first. `default`: an instance, or None."""
     inner = []
     for field in _own(struct):
         key, value = f"{prefix}{field.name}", _default(default, field)
@@ -61,14 +61,14 @@ def fields(struct: type[msgspec.Struct], default: Any = None, prefix: str = "") 
 
 @cache
 def _own(struct: type[msgspec.Struct]) -> tuple[kinds.Field, ...]:
-    """A struct's fields without those of the structs within it; msgspec translates its annotations again each time."""
+    """Returns a struct's own fields; cached, since msgspec evaluates the annotations at each call."""
     info = kinds.type_info(struct)
     assert isinstance(info, kinds.StructType)
     return info.fields
 
 
 def leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
-    """The keys of nested tables: {"a": {"b": 1}} has a.b."""
+    """Yields the keys of nested tables: {"a": {"b": 1}} has a.b."""
     for name, value in tree.items():
         if isinstance(value, Mapping):
             yield from leaves(value, f"{prefix}{name}.")
@@ -77,48 +77,48 @@ def leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
 
 
 def laid_over(tree: dict[str, Any], changes: Any) -> Any:
-    """Nested tables with the values of others in place of theirs."""
+    """Returns nested tables updated with `changes`."""
     if not isinstance(changes, dict):
         return changes
     return tree | {k: laid_over(tree[k], v) if isinstance(tree.get(k), dict) else v for k, v in changes.items()}
 
 
 def differences(tree: dict[str, Any], default: dict[str, Any]) -> dict[str, Any]:
-    """What of nested tables is not as in others."""
+    """Returns the entries of nested tables that differ from `default`."""
     changed = {k: v for k, v in tree.items() if v != default[k]}
     return {k: differences(v, default[k]) if isinstance(v, dict) else v for k, v in changed.items()}
 
 
 def is_key(name: str) -> bool:
-    """Whether a file may set it."""
+    """Whether a file may set this field."""
     return any(stands_for(pattern, name) for pattern in KEYS)
 
 
 def parted(settings: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The keys of users among settings, and the constants, as `load` takes them."""
+    """Splits settings into keys and constants, as `load` takes them."""
     keys = {name: value for name, value in settings.items() if is_key(name)}
     return keys, {name: value for name, value in settings.items() if name not in keys}
 
 
 def why_no_key(name: str, configuration: type[msgspec.Struct]) -> str:
-    """Of a field that no file may set: where it stands and how it is varied. "" of a key, and of what is no field."""
+    """Returns why a file may not set a constant, and how to set it; "" for a key and for an unknown field."""
     field = None if is_key(name) else next((f for f in fields(configuration) if stands_for(f.key, name)), None)
     if field is None:
         return ""
     return (
-        f"is a constant now and no key any more: field {field.name} of {field.place}. "
-        f'To vary it: --constant {name}=VALUE, or from Python load(..., constants={{"{name}": VALUE}})'
+        f"is a constant, not a key: field {field.name} of {field.place}. "
+        f'Set it by --constant {name}=VALUE, or from Python by load(..., constants={{"{name}": VALUE}})'
     )
 
 
 def stands_for(pattern: str, key: str) -> bool:
-    """Whether a key is one of a pattern's, whose words in capitals stand for any: models.ROLE.path."""
+    """Whether a key matches a pattern, whose words in capitals match any word: models.ROLE.path."""
     words, names = pattern.split("."), key.split(".")
     return len(words) == len(names) and all(w == n or w.isupper() for w, n in zip(words, names, strict=True))
 
 
 def _stated_by(struct: type[msgspec.Struct], name: str) -> type[msgspec.Struct]:
-    """The struct or the base of it that the field stands in."""
+    """Returns the struct or its base that defines the field."""
     return next(base for base in struct.__mro__ if name in inspect.get_annotations(base))
 
 
@@ -133,7 +133,7 @@ def _default(values: Any, field: kinds.Field) -> Any:
 
 
 def _struct_in(kind: kinds.Type) -> type[msgspec.Struct] | None:
-    """The struct that a field holds: itself, or None, or one for each name."""
+    """Returns the struct type of a field: direct, optional, or per name; None for other types."""
     if isinstance(kind, kinds.StructType):
         return kind.cls
     if isinstance(kind, kinds.DictType):

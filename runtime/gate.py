@@ -1,10 +1,9 @@
-"""The gate: planners outside the vehicle's own user read its estimates here, by mutual TLS, and write nothing.
+"""The gate: read-only access to a vehicle's estimates for planners on other machines, by mutual TLS.
 
     python -m birdslam.runtime.gate /etc/birdslam/vehicle.toml /etc/birdslam/gate.json5 --runtime-dir /run/birdslam
 
-A process of its own: one zenoh session that forwards what its file allows (deploy/gate.json5: listening address,
-certificates, access control) and decodes nothing. The car alone, by its own certificate, may write its speed here.
-Exit status: 0 after SIGTERM; 2, with one line on standard error, where the file does not make a closed gate.
+A zenoh session that forwards what its file allows (deploy/gate.json5: address, certificates, access control). Only the
+car may write its speed, by its own certificate. Exit status: 0 after SIGTERM; 2 for a file that is not restrictive.
 """
 
 from __future__ import annotations
@@ -37,18 +36,18 @@ _MUST_BE = {  # key -> its only value
     "access_control/enabled": True,
     "access_control/default_permission": "deny",
 }
-_WRITING = {"put", "delete", "declare_queryable", "reply", "liveliness_token"}  # as messages that come in
-_CAR_NAME = "the car"  # the common name of the one certificate that may write, and what: what CAR sends
+_WRITING = {"put", "delete", "declare_queryable", "reply", "liveliness_token"}  # incoming messages
+_CAR_NAME = "the car"  # common name of the only certificate that may write
 _CAR_KEYS = tuple(zenoh.KeyExpr(f"birdslam/*/{VERSION}/{topic}") for topic in CAR.sends)
 _MAX_ZENOH_BYTES = 2 * MAX_MESSAGE_BYTES + 4096
 
 
 class GateError(ConfigurationError):
-    """A gate that would be open, or can't be opened; names the file, the key and the reason."""
+    """The gate's file is not restrictive or invalid; the message names the file, the key and the reason."""
 
 
 def gate_config(path: Path, vehicle: str, runtime_dir: Path | None = None) -> zenoh.Config:
-    """The session's configuration: the file, checked, with the sockets of the vehicle's nodes. Raises GateError."""
+    """Returns the checked file with the sockets of the vehicle's nodes. Raises GateError."""
     try:
         config = zenoh.Config.from_file(str(path))
     except zenoh.ZError as error:
@@ -66,7 +65,7 @@ def gate_config(path: Path, vehicle: str, runtime_dir: Path | None = None) -> ze
     for key, value in (
         ("connect/endpoints", endpoints),
         ("connect/retry", _RETRY),
-        ("connect/timeout_ms", -1),  # the vehicle may start later, and again
+        ("connect/timeout_ms", -1),  # the vehicle may start later or restart
     ):
         config.insert_json5(key, json.dumps(value))
     return config
@@ -95,7 +94,7 @@ def _check_endpoints(path: Path, config: zenoh.Config) -> None:
 
 
 def _check_rules(path: Path, config: zenoh.Config) -> None:
-    """Refuses a policy by which others than the vehicle's own sockets may write, except the car its speed."""
+    """Rejects a policy that lets others than the vehicle's sockets write, except the speed by the car."""
     access = _get(config, "access_control")
     rules = {rule["id"]: rule for rule in access["rules"] or ()}
     inside = {s["id"] for s in access["subjects"] or () if s.get("link_protocols") == ["unixsock-stream"]}
@@ -112,7 +111,7 @@ def _check_rules(path: Path, config: zenoh.Config) -> None:
             if by_car and writes == {"put"} and all(map(_is_cars, rule["key_exprs"])):
                 continue
             if rule["permission"] == "allow" and writes and "ingress" in (rule.get("flows") or ("ingress",)):
-                raise GateError(f"{path}: access_control: rule {rule['id']!r} lets {', '.join(sorted(writes))} in")
+                raise GateError(f"{path}: access_control: rule {rule['id']!r} allows {', '.join(sorted(writes))}")
 
 
 def _is_cars(key_expr: str) -> bool:
@@ -120,10 +119,10 @@ def _is_cars(key_expr: str) -> bool:
 
 
 def run(path: Path, vehicle: str, runtime_dir: Path | None) -> None:
-    """Opens the gate, until SIGTERM or SIGINT. Raises GateError."""
+    """Runs the gate until SIGTERM or SIGINT. Raises GateError."""
     signals.block()
     config = gate_config(path, vehicle, runtime_dir)
-    zenoh.init_log_from_env_or("error,zenoh_link_tls=warn")  # why somebody was refused; RUST_LOG says otherwise
+    zenoh.init_log_from_env_or("error,zenoh_link_tls=warn")  # log refused connections; RUST_LOG overrides it
     try:
         session = zenoh.open(config)
     except zenoh.ZError as error:
@@ -132,18 +131,18 @@ def run(path: Path, vehicle: str, runtime_dir: Path | None) -> None:
         listen = ", ".join(json.loads(config.get_json("listen/endpoints")))
         serve(
             f"the gate of vehicle {vehicle!r} is open: {listen}",
-            lambda: f"{len(session.info.peers_zid())} nodes of the vehicle reached, open at {listen}",
+            lambda: f"{len(session.info.peers_zid())} nodes of the vehicle connected, open at {listen}",
         )
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Entry point of the gate's process."""
     parser = argparse.ArgumentParser(
-        prog="birdslam.runtime.gate", description="Lets planners beyond this machine read."
+        prog="birdslam.runtime.gate", description="Read-only access for planners on other machines."
     )
-    parser.add_argument("config", type=Path, metavar="CONFIG.toml", help="of the vehicle")
-    parser.add_argument("gate", type=Path, metavar="GATE.json5", help="zenoh's: addresses, certificates, access")
-    parser.add_argument("--runtime-dir", type=Path, metavar="DIR", help="as runtime.runtime_dir of the run")
+    parser.add_argument("config", type=Path, metavar="CONFIG.toml", help="configuration of the vehicle")
+    parser.add_argument("gate", type=Path, metavar="GATE.json5", help="zenoh settings: addresses, certificates, access")
+    parser.add_argument("--runtime-dir", type=Path, metavar="DIR", help="runtime.runtime_dir of the run")
     options = parser.parse_args(arguments)
     try:
         configuration = load(options.config)

@@ -1,4 +1,4 @@
-"""Where the time of a frame goes: fixed-size distributions of ages and stages, fed from the traces of messages."""
+"""Latency statistics: fixed-size distributions of ages and stages from the traces of messages."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _BINS = math.ceil(_BINS_PER_FACTOR * math.log(1e5 / _LOWEST_MS))  # up to 100 s
 
 
 class Distribution:
-    """Of durations in ms; its size does not grow with the drive. Percentiles are exact to 1 %, the maximum is exact."""
+    """A distribution of durations in ms, of fixed size. Percentiles are exact to 1 %, the maximum is exact."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -29,14 +29,14 @@ class Distribution:
         self.max_ms = max(self.max_ms, ms)
 
     def joined(self, other: Distribution) -> Distribution:
-        """Both together, again."""
+        """Returns the sum of both distributions."""
         out = Distribution()
         out.count, out.max_ms = self.count + other.count, max(self.max_ms, other.max_ms)
         out._bins = self._bins + other._bins
         return out
 
     def percentile(self, percent: float) -> float:
-        """In ms; NaN where nothing was added."""
+        """Returns a percentile in ms; NaN without data."""
         if not self.count:
             return math.nan
         rank = max(1, math.ceil(self.count * percent / 100.0))
@@ -44,7 +44,7 @@ class Distribution:
         return min(_LOWEST_MS * math.exp((position + 0.5) / _BINS_PER_FACTOR), self.max_ms)
 
     def summary(self) -> dict[str, float]:
-        """p50, p99 and max in ms, for a report; empty where nothing was added."""
+        """Returns p50, p99 and max in ms; empty without data."""
         if not self.count:
             return {}
         figures = {"p50": self.percentile(50.0), "p99": self.percentile(99.0), "max": self.max_ms}
@@ -52,7 +52,7 @@ class Distribution:
 
 
 class Recent:
-    """The distribution of the last `span_s` to twice that; of fixed size too."""
+    """The distribution over the last `span_s` to 2 `span_s`, of fixed size."""
 
     def __init__(self, span_s: float = 5.0) -> None:
         self._span_ns = round(span_s * 1e9)
@@ -70,7 +70,7 @@ class Recent:
             self._turn_ns = now_ns
 
     def spread(self, now_ns: int) -> Spread:
-        """What there was of late."""
+        """Returns the current spread."""
         self._turn(now_ns)
         both = self._older.joined(self._newer)
         if not both.count:
@@ -79,7 +79,7 @@ class Recent:
 
 
 def stages(trace: Trace, t_received_ns: int) -> Iterator[tuple[str, float]]:
-    """(name, ms) of each wait in a node's queue, of each step, of each hop between nodes, the last to the receiver."""
+    """Yields (name, ms) of each wait in a queue, each step, and each hop between nodes, the last to the receiver."""
     arrivals = [(after.node, after.arrived_ns or after.received_ns) for after in trace.stages[1:]]
     arrivals.append(("planner", t_received_ns))
     for stage, (receiver, arrival_ns) in zip(trace.stages, arrivals, strict=False):
@@ -90,10 +90,10 @@ def stages(trace: Trace, t_received_ns: int) -> Iterator[tuple[str, float]]:
 
 
 def queue_of(node: str) -> str:
-    """The name of the stage in which a record waits for the node, which is at another one."""
+    """Returns the name of the stage in which a record waits in the node's queue."""
     return f"{node} queue"
 
 
 def key_of(stage: str) -> str:
-    """A stage's name as a plain word, as in `budgets.capture_to_perceive_ms`."""
+    """Returns a stage's name as a key, as in `budgets.capture_to_perceive_ms`."""
     return stage.replace(" -> ", "_to_").replace(" ", "_")

@@ -1,4 +1,4 @@
-"""The configuration that a command line asks for: its file, with its options on top."""
+"""The configuration of a command line: its file, overridden by its options."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from birdslam.runtime.models import store as model_store
 
 
 def configuration_of(options: argparse.Namespace) -> Configuration:
-    """The configuration file with the options of the command line on top. Raises ConfigurationError."""
+    """Loads the configuration file, overridden by the options of the command line. Raises ConfigurationError."""
     overrides, named = overrides_of(options)
     return load(options.config, overrides, named, constants_of(options))
 
 
 def constants_of(options: argparse.Namespace) -> dict[str, Any]:
-    """What `--constant` says: fields of the typed configuration with their values."""
+    """Returns the fields and values of `--constant`."""
     return dict(parse_setting(text, "--constant") for text in options.constant)
 
 
 def overrides_of(options: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
-    """What the options of the command line say: keys with their values, and names of models."""
+    """Returns the keys and values, and the names of models, of the command line's options."""
     overrides: dict[str, Any] = dict(parse_setting(text) for text in options.set)
     named: list[str] = []
     for text in options.model:
@@ -55,10 +55,10 @@ def overrides_of(options: argparse.Namespace) -> tuple[dict[str, Any], list[str]
 
 
 def speeds_of(configuration: Configuration, drives: int) -> Path:
-    """The car's own speed in drives: a file for one, or a directory with one for each. Raises ConfigurationError."""
+    """Returns the speed file of a drive, or the directory of several drives. Raises ConfigurationError."""
     path = Path(configuration.source.speed).expanduser()
     if drives > 1 and not path.is_dir():
-        raise ConfigurationError(f"{path}: is the speed of one drive: for {drives} give a directory of their NAME.txt")
+        raise ConfigurationError(f"{path}: is the speed of one drive; for {drives} name a directory of NAME.txt files")
     return path
 
 

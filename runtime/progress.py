@@ -1,7 +1,4 @@
-"""How far long work has come, and how long it will go on.
-
-On a terminal one line that is refreshed; elsewhere a plain line a minute, so that a log shows that something goes on.
-"""
+"""Progress of long work: one refreshed line on a terminal, else one line per minute."""
 
 from __future__ import annotations
 
@@ -19,17 +16,17 @@ _Item = TypeVar("_Item")
 
 
 def time_to_go(seconds: float) -> str:
-    """A duration for a person: "0:07", "12:30", "1:02:30"."""
+    """Formats a duration: "0:07", "12:30", "1:02:30"."""
     minutes, rest = divmod(max(0, round(seconds)), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
 
 
 class Progress:
-    """A context: `advance` for each piece of work, or `reach` a count. `total` is None where it is unknown.
+    """A context manager: `advance` by pieces of work, or `reach` a count. `total`: None if unknown.
 
-    `scale` and `unit` say what is counted: ("frames", 1) or ("MB", 1e6). The time to go is that of the mean speed since
-    the first piece, so that loading is no part of it.
+    `unit` and `scale`: ("frames", 1) or ("MB", 1e6). The remaining time follows from the mean speed since the first
+    piece, without the time for loading.
     """
 
     def __init__(
@@ -47,16 +44,16 @@ class Progress:
         self._terminal = self._stream.isatty()
         self._period_s = REFRESH_S if self._terminal else PLAIN_LINE_S
         self.done = 0
-        self._first: tuple[float, int] | None = None  # when the first piece was done, and how many were then
+        self._first: tuple[float, int] | None = None  # time of the first piece, count at that time
         self._due_s = clock() + (0.0 if self._terminal else PLAIN_LINE_S)
         self._visible = False
 
     def advance(self, pieces: int = 1) -> None:
-        """So much more is done."""
+        """Adds finished pieces."""
         self.reach(self.done + pieces)
 
     def reach(self, done: int) -> None:
-        """So much is done in all."""
+        """Sets the number of finished pieces."""
         self.done = done
         now_s = self._clock()
         if self._first is None or done < self._first[1]:  # a second pass restarts
@@ -67,7 +64,7 @@ class Progress:
         self._write(self.line(now_s))
 
     def line(self, now_s: float) -> str:
-        """What is shown."""
+        """Returns the progress line."""
         shape = "d" if self._scale == 1.0 else ".1f"
         done, total = (None if n is None else format(n if shape == "d" else n / self._scale, shape)
                        for n in (self.done, self.total))  # fmt: skip
@@ -94,7 +91,7 @@ class Progress:
         self.clear()
 
     def clear(self) -> None:
-        """Takes the line away: what follows says how it went."""
+        """Removes the line."""
         if self._visible:
             self._stream.write("\r\x1b[K")
             self._stream.flush()
@@ -102,7 +99,7 @@ class Progress:
 
 
 def with_progress(items: Iterable[_Item], what: str, total: int | None) -> Iterator[_Item]:
-    """The items, with progress in frames."""
+    """Yields the items, with progress in frames."""
     with Progress(what, total, "frames") as progress:
         for item in items:
             yield item
@@ -110,5 +107,5 @@ def with_progress(items: Iterable[_Item], what: str, total: int | None) -> Itera
 
 
 def file_progress(what: str, path: Path) -> Progress:
-    """For reading a file, in MB."""
+    """Returns the progress for reading a file, in MB."""
     return Progress(what, path.stat().st_size if path.is_file() else None, "MB", 1e6)

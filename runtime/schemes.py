@@ -1,4 +1,4 @@
-"""All sources: those of birdslam/sources/schemes.py, then those of the runtime: our own recordings, live cameras."""
+"""The table of all sources: those of birdslam/sources/schemes.py and those of the runtime (recordings, cameras)."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from birdslam.sources import schemes as recorded
 from birdslam.sources.schemes import Scheme
 
 OF_A_CAMERA = ("reopen_ms", "camera_timeout_s")
-OF_RECORDINGS = ("speed", "odometry", "detections")  # files beside one, which no live camera has
+OF_RECORDINGS = ("speed", "odometry", "detections")  # files that accompany a recording
 
 MCAP = Scheme(
     name="mcap",
     written=("mcap:FILE",),
-    what="the images of a recording of ours, made with `--record-images`: [recording.md](recording.md)",
+    what="the images of a BirdSLAM recording, made with `--record-images`: [recording.md](recording.md)",
     opener="birdslam.runtime.recording.recorded_images:RecordedImages",
     camera="calibration",
     clock="recorded times",
-    is_at=lambda path: path.suffix.lower() == ".mcap" and not path.is_dir(),  # one of ROS has been recognised before
+    is_at=lambda path: path.suffix.lower() == ".mcap" and not path.is_dir(),  # ROS bags are recognised before
     recognised="any other .mcap file",
 )
 _live = partial(Scheme, clock="this computer's", live=True, refused=OF_RECORDINGS)
@@ -42,7 +42,7 @@ RTSP = _live(
 ROS = _live(
     name="ros",
     written=("ros:/TOPIC",),
-    what="images of ROS 2 as they come, from a topic at a router of rmw_zenoh, without ROS: [ros.md](ros.md)",
+    what="live images of a ROS 2 topic at a router of rmw_zenoh, without ROS: [ros.md](ros.md)",
     opener="birdslam.runtime.ros.camera:RosCamera",
     camera="intrinsics",
     address="topic",
@@ -53,16 +53,16 @@ OF_THE_RUNTIME = (MCAP, V4L2, RTSP, ROS)
 
 
 def all_schemes() -> tuple[Scheme, ...]:
-    """The whole table, in the order in which a path is recognised."""
+    """Returns all schemes, in the order in which they are tried on a path."""
     return (*recorded.RECORDED, *OF_THE_RUNTIME)
 
 
 def recorded_schemes() -> tuple[Scheme, ...]:
-    """The sources that are no live cameras."""
+    """Returns the sources of recordings."""
     return tuple(scheme for scheme in all_schemes() if not scheme.live)
 
 
 def is_live(uri: str) -> bool:
-    """Whether a camera delivers the frames; so too where no source is named yet."""
+    """Whether the source is a live camera; also true for an empty or unknown one."""
     scheme = recorded.scheme_of(uri, all_schemes())
     return scheme is None or scheme.live

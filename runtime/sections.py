@@ -1,4 +1,4 @@
-"""The tables of the configuration that are the shell's own; those of the method stand beside its code."""
+"""The tables of the configuration of the runtime; those of the method are beside its code."""
 
 from __future__ import annotations
 
@@ -20,44 +20,44 @@ Share = Annotated[float, msgspec.Meta(gt=0.0, le=1.0)]
 
 
 class SourceConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Where frames come from, and how fast."""
+    """The source of frames and its rate."""
 
-    uri: str = ""  # where frames come from, as docs/sources.md lists: video:FILE, v4l2:/dev/videoN, ...
-    rate: Positive | Literal["max"] | None = None  # Hz; None: by the source's own time stamps; "max": lossless
-    stride: PositiveInt = 1  # one frame of a recording in so many
-    speed: str = ""  # FILE of the car's own speed over a recording: lines of time in s, speed in m/s; "": none
-    # FILE of another odometry over a recording, in place of the images': TUM lines or KITTI rows, metric; "": none
+    uri: str = ""  # source of frames, see docs/sources.md: video:FILE, v4l2:/dev/videoN, ...
+    rate: Positive | Literal["max"] | None = None  # Hz; None: by the source's time stamps; "max": lossless
+    stride: PositiveInt = 1  # use every n-th frame of a recording
+    speed: str = ""  # FILE with the car's speed for a recording: lines of time in s, speed in m/s; "": none
+    # FILE with external odometry for a recording, instead of visual odometry: TUM lines or KITTI rows; "": none
     odometry: str = ""
-    detections: str = ""  # FILE of another detector's boxes over a recording: MOT, KITTI tracking or COCO; "": none
-    detector: Family = "unknown"  # whose boxes these are, which says how sure their edges are
+    detections: str = ""  # FILE with external detections for a recording: MOT, KITTI tracking or COCO; "": none
+    detector: Family = "unknown"  # family of the external detector, which determines the noise of box edges
     topics: BagTopics = BagTopics()  # of a ROS bag
-    frames: PositiveInt | None = None  # end after so many; None: all
-    loop: bool = False  # a recording restarts at its end
-    prefetch_frames: PositiveInt = 4  # decoded ahead of their time, so that a slow file is not a late frame
-    reopen_ms: Positive = 100.0  # between tries to open a camera that is gone; each is a frame without an image
-    camera_timeout_s: Positive = 5.0  # a camera or stream that delivers nothing for so long has failed
+    frames: PositiveInt | None = None  # maximum number of frames; None: all
+    loop: bool = False  # restart a recording at its end
+    prefetch_frames: PositiveInt = 4  # frames decoded ahead
+    reopen_ms: Positive = 100.0  # between attempts to reopen a camera; each gives a frame without an image
+    camera_timeout_s: Positive = 5.0  # a camera or stream without a frame for this time has failed
 
 
 class ModelsConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The network of each role; a role without one goes unfilled."""
+    """The network of each role; a role may have none."""
 
     detector: ModelSpec | None = None
     segmenter: ModelSpec | None = None
     depth: ModelSpec | None = None
-    multitask: ModelSpec | None = None  # one network for all of these; the others stand before it, each for its own
+    multitask: ModelSpec | None = None  # one network for all of these roles; the others override it for their roles
     pointnet: ModelSpec | None = None  # Frustum-PointNet: bodies from the depth network's points
-    shipped: bool = True  # the package's own network runs where no other finds vehicles or the road
-    # the multi-task network looks beside another detector, whose boxes get the bodies (depth, length, yaw) it finds
+    shipped: bool = True  # run the shipped network for roles that no other network has
+    # run the multi-task network beside another detector and assign its bodies (depth, length, yaw) to the boxes
     bodies: bool = False
-    completion: bool = True  # the package's own ENet completes the lanes where something hid the road
+    completion: bool = True  # complete occluded lanes with the shipped ENet
 
     def given(self) -> dict[str, ModelSpec]:
-        """Role -> network that the user names, in a fixed order."""
+        """Returns role -> network as configured, in a fixed order."""
         specs = {role: getattr(self, role) for role in get_args(Role)}
         return {role: spec for role, spec in specs.items() if spec is not None}
 
     def in_use(self) -> dict[str, ModelSpec]:
-        """Role -> network of images that runs, in a fixed order."""
+        """Returns role -> image network that runs, in a fixed order."""
         given = self.given()
         unfilled = not {"detector", "segmenter"} <= set(given)
         if self.shipped and "multitask" not in given and (unfilled or self.bodies):
@@ -66,76 +66,74 @@ class ModelsConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
 
 class Turn(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """When a head of perceive runs: on each n-th frame, or at a rate that the source's frame rate makes n."""
+    """When a head of perceive runs: on every n-th frame, or at a rate."""
 
-    every: PositiveInt | None = None  # on each n-th frame
-    hz: Positive | None = None  # runs a second; not beside `every`
+    every: PositiveInt | None = None  # on every n-th frame
+    hz: Positive | None = None  # runs per second; excludes `every`
 
     def __post_init__(self) -> None:
         if self.every is not None and self.hz is not None:
-            raise ValueError("every and hz say the same: one of them")
+            raise ValueError("every and hz exclude each other")
 
     def at(self, rate_hz: float) -> Turn:
-        """In frames of a source of that rate."""
+        """Converts the rate to frames of a source with this frame rate."""
         if self.hz is None:
             return self
         return msgspec.structs.replace(self, every=max(1, round(rate_hz / self.hz)), hz=None)
 
 
 class NetworkTurn(Turn, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Of a network of images. What is None is its manifest's to say."""
+    """The schedule of an image network; None: as in its manifest."""
 
-    awaited: bool | None = None  # False: no frame waits for it, not even up to its deadline
+    awaited: bool | None = None  # False: frames do not wait for it
 
 
 class ScheduleConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Which head runs when. A head that is late is skipped and its last result carried, with its age and a status."""
+    """The schedule of the heads. For a late head the last result is used, with its age and a status."""
 
     detector: NetworkTurn = NetworkTurn()
     segmenter: NetworkTurn = NetworkTurn()
     depth: NetworkTurn = NetworkTurn()
     multitask: NetworkTurn = NetworkTurn()
-    lanes: Turn = Turn(hz=5.0)  # made out of many frames, their completion with it; on a thread that nobody awaits
+    lanes: Turn = Turn(hz=5.0)  # from many frames, with completion; on a background thread
 
     def of(self, role: str, spec: ModelSpec) -> ModelSpec:
-        """The network of a role as this schedule has it run; `at` comes before."""
+        """Returns the network of a role with this schedule; call `at` before."""
         turn: NetworkTurn = getattr(self, role)
-        said = {key: value for key in ("every", "awaited") if (value := getattr(turn, key)) is not None}
-        return msgspec.structs.replace(spec, **said)
+        changes = {key: value for key in ("every", "awaited") if (value := getattr(turn, key)) is not None}
+        return msgspec.structs.replace(spec, **changes)
 
     def at(self, rate_hz: float) -> ScheduleConfig:
-        """In frames of a source of that rate."""
+        """Converts the rates to frames of a source with this frame rate."""
         return ScheduleConfig(**{head: getattr(self, head).at(rate_hz) for head in self.__struct_fields__})
 
 
 class LooksConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How often networks look where the user does not say it; never at rate "max" (runtime/nodes/look_rate.py)."""
+    """Adaptive rate of the networks, not at rate "max" (runtime/nodes/look_rate.py)."""
 
-    adaptive: bool = True  # False: as each network's manifest says, whatever the computer
-    measured_s: Positive = 1.0  # all networks together are measured for so long before the first frame
-    least_hz: Positive = 3.0  # not fewer looks a second than this
-    # Cores: networks that keep no more busy look no less often. Less than pays by itself, since each look also has its
-    # vehicles placed and tracked; on the shipped drive with two slow cores, where every 3rd frame was too often
-    slight_load: Positive = 0.16
-    awaited_share: Share = 0.45  # of a frame's period: a network that takes longer is not awaited
-    room_share: Share = 0.6  # of the cores that the front end leaves, the networks begin with so much
-    busy_share: Share = 0.92  # of the period: perceive's mean step takes longer, and the networks look less often
-    calm_share: Share = 0.72  # ... and they look more often where it takes less
-    window_frames: PositiveInt = 10  # over which the step's mean is taken
-    calm_frames: PositiveInt = 60  # in a row, before they look more often; twice as many after a try that failed
-    most_calm_frames: PositiveInt = 2000  # but no more than this
+    adaptive: bool = True  # False: as in each network's manifest
+    measured_s: Positive = 1.0  # duration of the timing of all networks before the first frame
+    least_hz: Positive = 3.0  # minimum rate
+    slight_load: Positive = 0.16  # cores: below this load of the networks the rate is not reduced further
+    awaited_share: Share = 0.45  # of a frame's period: frames do not wait for slower networks
+    room_share: Share = 0.6  # initial load of the networks, as a share of the cores left by the front end
+    busy_share: Share = 0.92  # of the period: above this mean step of perceive the rate is reduced
+    calm_share: Share = 0.72  # of the period: below this mean step the rate is raised
+    window_frames: PositiveInt = 10  # for the mean of the step
+    calm_frames: PositiveInt = 60  # consecutive frames before the rate is raised; doubled after a failed attempt
+    most_calm_frames: PositiveInt = 2000  # limit of this doubling
 
 
 class PerceiveConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The perceive process."""
 
-    # From its capture on a frame waits so long for networks, at rate "max" to their end; None: by the frame rate
+    # how long a frame waits for networks after its capture, at rate "max" without limit; None: by the frame rate
     deadline_ms: Positive | None = None
-    # The same in periods of the source's frames: the rest of a period is for what comes after the networks
+    # the deadline in periods of the source's frames; the rest of a period is for the steps after the networks
     deadline_periods: Positive = 0.75
-    period_ms: Positive | None = None  # from one frame of the source to the next; None: by the frame rate
-    opencv_threads: PositiveInt = 1  # of OpenCV in perceive: a second one spins, and takes the networks' core
-    provider: Provider = "auto"  # what computes the networks (runtime/models/providers.py)
+    period_ms: Positive | None = None  # between two frames of the source; None: by the frame rate
+    opencv_threads: PositiveInt = 1  # of OpenCV in perceive; a second one would take the networks' core
+    provider: Provider = "auto"  # execution provider of the networks (runtime/models/providers.py)
     schedule: ScheduleConfig = ScheduleConfig()
     looks: LooksConfig = LooksConfig()
 
@@ -143,46 +141,45 @@ class PerceiveConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 class RuntimeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Processes, memory and time limits."""
 
-    runtime_dir: str = ""  # sockets, locks and vitals; "": the user's own (runtime/transport/presence.py)
-    models_dir: str = ""  # installed networks; "": the user's own (runtime/models/store.py)
+    runtime_dir: str = ""  # sockets, locks and vitals; "": the user's default (runtime/transport/presence.py)
+    models_dir: str = ""  # installed networks; "": the user's default (runtime/models/store.py)
     ring_slots: Annotated[int, msgspec.Meta(ge=2, le=64)] = 8  # frames in shared memory
     in_flight_frames: PositiveInt = 4  # frames between capture and the estimate at rate "max"
     ready_timeout_s: Positive = 60.0  # for a node to load, warm up and find its peers
-    drain_timeout_s: Positive = 2.0  # for the last frame's estimate to come back before the end is announced
+    drain_timeout_s: Positive = 2.0  # for the last frame's estimate to arrive before END_OF_SOURCE is sent
     stop_timeout_s: Positive = 10.0  # for all nodes to end
-    beat_s: Positive = 0.1  # a node's loop shows life at least so often
-    # A ready node without a beat for so long is stalled; None: 2 s, at rate "max", where nobody waits for it, a minute
+    beat_s: Positive = 0.1  # maximum interval of a node's heartbeat
+    # a ready node without a heartbeat for this time is stalled; None: 2 s, at rate "max" 60 s
     watchdog_ms: Annotated[float, msgspec.Meta(ge=200.0)] | None = None
     term_grace_ms: Positive = 200.0  # between a stalled node's SIGTERM and its SIGKILL
-    switch_interval_s: Positive = 5e-4  # of the GIL, for the threads that wait beside a busy one
-    # A node that died or stalled is restarted; None: "always", but "never" at rate "max", which may lose no frame
+    switch_interval_s: Positive = 5e-4  # of the GIL
+    # restart of dead and stalled nodes; None: "always", but "never" at rate "max", which must not lose a frame
     restart: Literal["always", "never"] | None = None
-    restarts_max: PositiveInt = 5  # of one node within the window: one more ends the run
-    restart_window_s: Positive = 60.0  # in which they count
-    restart_backoff_ms: Positive = 100.0  # before the second restart within the window; then twice as long each time
-    restart_backoff_max_ms: Positive = 2000.0  # at most
-    checkpoint_ms: Positive = 250.0  # of the optimizer's graph, for the process after it
-    catch_up_ms: Positive = 300.0  # it asks perceive for what it has missed since, and waits no longer
-    stale_ms: Positive = 500.0  # a node that has received nothing for so long says so in its health
-    spares: bool = True  # a process of each node stands by, loaded and warm, for the next restart
+    restarts_max: PositiveInt = 5  # of one node within the window; one more ends the run
+    restart_window_s: Positive = 60.0  # window of restarts_max
+    restart_backoff_ms: Positive = 100.0  # before the second restart within the window, then doubled each time
+    restart_backoff_max_ms: Positive = 2000.0  # limit of this doubling
+    checkpoint_ms: Positive = 250.0  # interval of checkpoints of the optimizer's graph
+    catch_up_ms: Positive = 300.0  # timeout of a restarted optimizer for the measurements that perceive retains
+    stale_ms: Positive = 500.0  # a node without input for this time has the status INPUT_STALE
+    spares: bool = True  # keep a loaded spare process of each node for the next restart
 
 
 class BudgetsConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How long each node, each hop and the whole may take, from a frame's capture on, at `percentile` of the frames.
+    """Latency budgets of each node, each hop and the whole, from a frame's capture on, at a percentile of the frames.
 
-    What waits in a node's queue waits because that node is at another record: the node's budget holds both together.
-    Raises ValueError where the parts exceed the whole.
+    A node's budget includes the wait in its queue. Raises ValueError if the parts exceed the whole.
     """
 
-    # of the frames must keep each limit, in percent
+    # percentage of frames that must meet each budget
     percentile: Annotated[float, msgspec.Meta(gt=0.0, le=100.0)] = 99.0
-    capture_ms: Positive = 10.0  # capture's step
-    capture_to_perceive_ms: Positive = 10.0  # the hop, until the frame has arrived there
-    perceive_ms: Positive = 100.0  # perceive's step, with the frame's wait in its queue
-    perceive_to_optimize_ms: Positive = 10.0  # the hop, until the measurements have arrived there
-    optimize_ms: Positive = 10.0  # optimize's step, with the measurements' wait in its queue
-    optimize_to_planner_ms: Positive = 10.0  # the hop, with its wait in a queue
-    end_to_end_ms: Positive = 150.0  # the whole, from the frame's capture to the planner
+    capture_ms: Positive = 10.0  # step of capture
+    capture_to_perceive_ms: Positive = 10.0  # hop to perceive
+    perceive_ms: Positive = 100.0  # step of perceive, with the wait in its queue
+    perceive_to_optimize_ms: Positive = 10.0  # hop to optimize
+    optimize_ms: Positive = 10.0  # step of optimize, with the wait in its queue
+    optimize_to_planner_ms: Positive = 10.0  # hop to the planner, with the wait in its queue
+    end_to_end_ms: Positive = 150.0  # from the frame's capture to the planner
 
     def __post_init__(self) -> None:
         parts = [name for name in self.__struct_fields__ if name not in ("percentile", "end_to_end_ms")]
@@ -191,116 +188,116 @@ class BudgetsConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
             raise ValueError(f"{' + '.join(parts)} = {total_ms:g} is over end_to_end_ms = {self.end_to_end_ms:g}")
 
     def step_ms(self, node: str) -> float:
-        """What one node may take for a frame, its wait in the queue included."""
+        """Returns the budget of one node per frame, including the wait in its queue."""
         limit_ms: float = getattr(self, f"{node}_ms")
         return limit_ms
 
     def hop_ms(self, node: str) -> float | None:
-        """What a record may take on its way to a node; None for capture, to which none comes."""
+        """Returns the budget of the hop to a node; None for capture."""
         hops = {"perceive": self.capture_to_perceive_ms, "optimize": self.perceive_to_optimize_ms}
         return hops.get(node)
 
     @property
     def perceived_ms(self) -> float:
-        """The age by which perceive must have sent its measurements."""
+        """Maximum age at which perceive sends its measurements."""
         return self.capture_ms + self.capture_to_perceive_ms + self.perceive_ms
 
     @property
     def received_ms(self) -> float:
-        """The age by which a frame must have come to perceive."""
+        """Maximum age at which a frame arrives at perceive."""
         return self.capture_ms + self.capture_to_perceive_ms
 
 
 class DegradationConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """When perceive does less, to keep its budget, and when it does more again (runtime/nodes/degradation.py)."""
+    """Load shedding of perceive (runtime/nodes/degradation.py)."""
 
-    enabled: bool = True  # never at rate "max"
-    window_frames: PositiveInt = 10  # judged together
-    late_share: Share = 0.5  # so many of them late: one mode less
-    calm_frames: PositiveInt = 50  # in a row within `calm_share` of the budget: one mode more
+    enabled: bool = True  # no effect at rate "max"
+    window_frames: PositiveInt = 10  # window of late_share
+    late_share: Share = 0.5  # share of late frames that lowers the mode
+    calm_frames: PositiveInt = 50  # consecutive frames within `calm_share` of the budget that raise the mode
     calm_share: Share = 0.7  # of the budget; see calm_frames
-    rate_divisor: PositiveInt = 3  # in mode "rate" the networks run on one frame in so many at the most
-    coast_divisor: PositiveInt = 3  # in mode "coasting" one frame in so many is looked at
-    coast_max_ms: Positive = 500.0  # of source time without a look: what comes then is invalid
+    rate_divisor: PositiveInt = 3  # in mode "rate" the networks run at most on every n-th frame
+    coast_divisor: PositiveInt = 3  # in mode "coasting" every n-th frame is processed
+    coast_max_ms: Positive = 500.0  # source time without measured ego motion until estimates are invalid
 
 
 class RecordingConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What is kept of a drive in one file (runtime/recording/recording.py)."""
+    """The recording of a drive (runtime/recording/recording.py)."""
 
     file: str = ""  # FILE.mcap, which must not exist yet; a directory: a new file in it, named by the time; "": none
-    images: bool = False  # the frames too, as JPEG
+    images: bool = False  # record the frames as JPEG
     jpeg_quality: Annotated[int, msgspec.Meta(ge=1, le=100)] = 90  # of the frames
-    flush_ms: Annotated[float, msgspec.Meta(gt=0.0, le=1000.0)] = 500.0  # what a kill may cost
-    sync: bool = True  # each time to the disk itself: a power cut then costs no more than a kill
-    queue: PositiveInt = 4096  # messages of a topic that wait for the recorder; what is pushed out is counted
-    ready_timeout_s: Positive = 10.0  # for the recorder to be there before the first frame; then the run goes on
+    flush_ms: Annotated[float, msgspec.Meta(gt=0.0, le=1000.0)] = 500.0  # interval of writes; a kill loses so much
+    sync: bool = True  # sync each write to the disk, for the same guarantee at a power cut
+    queue: PositiveInt = 4096  # length of the recorder's queue per topic; dropped messages are counted
+    ready_timeout_s: Positive = 10.0  # maximum wait for the recorder before the first frame
 
 
 class ResultsConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What is made of a drive when it is over, beside the live results (runtime/supervision/final_results.py)."""
+    """Results in addition to the live ones (runtime/supervision/final_results.py)."""
 
-    smooth: bool = False  # final trajectories too, by the RTS smoother: tracks/ID.final.tum.txt, ego.final.*
+    smooth: bool = False  # write final trajectories by the RTS smoother: tracks/ID.final.tum.txt, ego.final.*
     video: str = ""  # FILE.mp4: the frames with the estimated boxes beside the bird's-eye view; "": none
-    map: str = ""  # FILE: the map of places, localised in and made longer; "": none
-    gnss: str = ""  # FILE: fixes, by which the drive and its map come to Earth; "": none
-    gnss_offset_s: float | None = None  # from the file's first fix to the first frame; None: by their clocks and shapes
-    map_only: str = ""  # FILE: localised in it, and it stays as it is; "": none
+    map: str = ""  # FILE: the map to localise in and to extend; "": none
+    gnss: str = ""  # FILE: GNSS fixes that georeference the drive and its map; "": none
+    gnss_offset_s: float | None = None  # from the first fix of the file to the first frame; None: by clocks and shapes
+    map_only: str = ""  # FILE: the map to localise in without extending it; "": none
 
 
 class FleetConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How this computer reaches the router of a fleet: as a vehicle that publishes, or as a listener to all of them."""
+    """The connection of this computer to the router of a fleet, as a vehicle or as a listener."""
 
-    router: str = ""  # tls/HOST:PORT; "": there is none
+    router: str = ""  # tls/HOST:PORT; "": none
     ca: str = ""  # FILE.pem: the fleet's authority
     certificate: str = ""  # FILE.pem: this computer's own
     key: str = ""  # FILE: its private key
-    estimates_hz: Positive | None = None  # of the vehicle's estimates at most so many a second are sent; None: all
-    # The vehicles that a listener expects: it lists them even before they have published anything
+    estimates_hz: Positive | None = None  # maximum rate of the sent estimates; None: all
+    # expected vehicles of a listener, listed before their first message
     vehicles: tuple[VehicleName, ...] = ()
 
 
 class RosConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How this computer is a node of ROS 2: of `birdslam ros`, and of the source `ros:/TOPIC`."""
+    """The ROS 2 node of `birdslam ros` and of the source `ros:/TOPIC`."""
 
     router: str = "tcp/localhost:7447"  # of rmw_zenoh
     domain: Annotated[int, msgspec.Meta(ge=0, le=232)] | None = None  # None: that of ROS_DOMAIN_ID, else 0
-    # "" or /NAME: before the names of our own topics, and of our frames, where several cars are in one domain
+    # "" or /NAME: prefix of BirdSLAM's topics and frames, for several cars in one domain
     namespace: str = ""
-    release: Literal["humble", "jazzy"] = "jazzy"  # of the others; jazzy: since Iron types have hashes
+    release: Literal["humble", "jazzy"] = "jazzy"  # of the other nodes; jazzy: with type hashes, from Iron on
 
 
 class RouterConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The router of a fleet: who may publish, who may listen, and how much of it passes."""
+    """The router of a fleet: permissions and rate limit."""
 
-    listen: str = "tls/127.0.0.1:7448"  # where vehicles and listeners connect to
+    listen: str = "tls/127.0.0.1:7448"  # address for vehicles and listeners
     ca: str = ""  # FILE.pem: the fleet's authority
     certificate: str = ""  # FILE.pem: the router's own
     key: str = ""  # FILE: its private key
     vehicles: tuple[VehicleName, ...] = ()  # each may write its own keys, by a certificate named "vehicle NAME"
-    # The common names of the certificates that may read all vehicles, and write nothing
+    # common names of the certificates that may read all vehicles
     listeners: tuple[ListenerName, ...] = ()
-    # Of a vehicle's messages on one key so many a second pass, the rest is dropped: a flood meets it alone
+    # rate limit of a vehicle's messages per key; the rest is dropped
     messages_hz: Positive = 200.0
 
 
 class NodeScheduling(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Of one node."""
+    """The scheduling of one node."""
 
     priority: Annotated[int, msgspec.Meta(ge=1, le=98)] = 10  # under SCHED_FIFO
-    cpus: tuple[Annotated[int, msgspec.Meta(ge=0)], ...] = ()  # the cores it may run on; none: all
+    cpus: tuple[Annotated[int, msgspec.Meta(ge=0)], ...] = ()  # allowed cores; empty: all
 
 
 class RealtimeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The scheduling of the nodes, where the system permits it (process/realtime.py); a line in the log where not."""
+    """The scheduling of the nodes, if permitted, else with a warning (process/realtime.py)."""
 
-    # SCHED_FIFO; "auto": all nodes with a live camera, else capture and optimize; of perceive the frames go by nice -20
+    # SCHED_FIFO; "auto": all nodes with a live camera, else capture and optimize, and nice -20 for perceive's frames
     fifo: Literal["auto", "on", "off"] = "auto"
-    lock_memory: Literal["auto", "on", "off"] = "auto"  # nothing is paged out; "auto": with a live camera
+    lock_memory: Literal["auto", "on", "off"] = "auto"  # lock memory against paging; "auto": with a live camera
     capture: NodeScheduling = NodeScheduling(priority=30)
     perceive: NodeScheduling = NodeScheduling(priority=10)
     optimize: NodeScheduling = NodeScheduling(priority=20)
 
     def of(self, node: str) -> NodeScheduling:
-        """The scheduling of one node."""
+        """Returns the scheduling of one node."""
         scheduling: NodeScheduling = getattr(self, node)
         return scheduling

@@ -1,4 +1,4 @@
-"""The whole system on one screen: which nodes there are, and which records pass between them (docs/planner.md).
+"""The nodes of the system and the records that pass between them (docs/planner.md).
 
 speed of the car, if it sends one
           v
@@ -28,10 +28,9 @@ _KEY = re.compile(rf"birdslam/({_NAME.pattern})/{VERSION}/([A-Za-z0-9_/-]+)")
 class Topic:
     """One kind of message.
 
-    A reader's queue holds `depth` messages: of a `hot` topic only the newest counts (depth 1), of others a few wait.
-    When it is full the oldest is dropped, and counted. `urgent` topics are sent before the rest, in the order of puts.
-    The producer answers a query of the topic's own key with its last `retained` messages, for those that come late.
-    `pace`: how often there is one.
+    `depth`: length of a reader's queue; if full, the oldest message is dropped and counted. `hot`: only the newest
+    message matters (depth 1). `urgent`: sent before other topics. `retained`: number of last messages with which the
+    producer answers queries of late readers. `pace`: how often it is sent.
     """
 
     name: str
@@ -62,21 +61,21 @@ NODES = {
     )
 }
 RECORDER = Node("record", receives=("frame", "measurements", "estimate", "map", "map_pose"), sends=("health/record",))
-CAR = Node("car", receives=(), sends=("speed",))  # no process of ours: what knows the speed of the wheels, if any does
+CAR = Node("car", receives=(), sends=("speed",))  # an external process that publishes the wheel speed, optional
 MAP = Node("map", receives=("frame", "estimate"), sends=("map_pose", "health/map"))
-# The last two are there only where a drive is recorded, or driven in a map of places; no node waits for them
+# The last two are optional; no node waits for them
 PROCESSES = {**NODES, RECORDER.name: RECORDER, MAP.name: MAP}
 
 TOPICS = {
     topic.name: topic
     for topic in (
-        # As many as a frame bears (sources/speed_log.py): what does not fit in no frame would have had
-        Topic("speed", SpeedReading, CAR.name, depth=200, pace="as often as the car says it, 20 to 100 times a second"),
+        # As many as fit into a frame (sources/speed_log.py)
+        Topic("speed", SpeedReading, CAR.name, depth=200, pace="at the car's rate, 20 to 100 times a second"),
         Topic("frame", FrameRef, "capture", depth=1, hot=True),
-        # A lost one breaks the chain of edges: a few are queued, and an optimizer that restarts asks for the last
+        # A lost one breaks the chain of edges, so a few are queued; a restarted optimizer queries the last ones
         Topic("measurements", Measurements, "perceive", depth=8, retained=96),
         Topic("estimate", Estimate, "optimize", depth=1, hot=True, retained=1),
-        Topic("map", MapUpdate, "optimize", depth=256, pace="each frame in which the map gained something"),
+        Topic("map", MapUpdate, "optimize", depth=256, pace="each frame with new map points"),
         Topic(
             "map_pose", MapPose, "map", depth=1, hot=True, urgent=False, retained=1, pace="each frame, some time later"
         ),
@@ -108,17 +107,17 @@ QUERIES = {
         Query(
             "trajectory",
             Trajectory,
-            "where everybody has been, in the newest epoch",
-            {"last_s": "only the last so many seconds of the source's time; left out: all"},
+            "all trajectories of the newest epoch",
+            {"last_s": "only the last seconds of source time; default: all"},
         ),
-        Query("nearby", Nearby, "every road user by its closest approach, were all to go on as they move now", {}),
+        Query("nearby", Nearby, "every road user by its closest approach at constant velocity", {}),
         Query("configuration", dict, "the configuration of the run, as in summary.json, without passwords", {}),
     )
 }
 
 
 def check_name(what: str, name: str) -> str:
-    """`name` itself. Raises ValueError where it can't be part of a key, a socket's path and a file's name at once."""
+    """Returns `name`. Raises ValueError if it is not valid in keys, socket paths and file names."""
     if not _NAME.fullmatch(name):
         raise ValueError(
             f"{what} {name!r} needs 1 to 32 letters, digits, '_' or '-', and starts with a letter or a digit"
@@ -127,19 +126,19 @@ def check_name(what: str, name: str) -> str:
 
 
 def key_of(vehicle: str, topic: str) -> str:
-    """The zenoh key of a topic or a query. Raises ValueError for a bad vehicle name, KeyError for neither."""
+    """Returns the key of a topic or a query. Raises ValueError for an invalid vehicle name, KeyError for neither."""
     name = QUERIES[topic].name if topic in QUERIES else TOPICS[topic].name
     return f"birdslam/{check_name('vehicle', vehicle)}/{VERSION}/{name}"
 
 
 def alive_key(vehicle: str, node: str) -> str:
-    """The key of a node's liveliness token; `node` = "*" stands for all of them."""
+    """Returns the key of a node's liveliness token; `node` = "*": all nodes."""
     name = node if node == "*" else check_name("node", node)
     return f"birdslam/{check_name('vehicle', vehicle)}/{VERSION}/alive/{name}"
 
 
 def every_key(topic: str) -> str:
-    """The key expression of a topic, a query or `alive/NODE` of every vehicle; `*` stands for all nodes."""
+    """Returns the key expression of a topic, a query or `alive/NODE` of all vehicles; `*`: all nodes."""
     return f"birdslam/*/{VERSION}/{topic}"
 
 

@@ -1,9 +1,8 @@
-"""Records to bytes and back: plain MessagePack, so that a planner in any language can read it.
+"""Encodes and decodes records as MessagePack.
 
-What comes in is never trusted: sizes are limited before anything is built, then types, ranges and finite numbers are
-checked. Whatever is wrong with the bytes, the only exception is WireError. Of a SpeedReading alone numbers may be other
-than finite: a failing sensor sends such numbers, and the reader answers with a status.
-Versions: fields that a newer sender appended are ignored; a changed meaning is a new version in the topic's key.
+Input is untrusted: sizes are limited before decoding; then types, ranges and finite numbers are checked. The only
+exception is WireError. Only a SpeedReading may have non-finite numbers, which a failing sensor sends.
+Versions: fields appended by a newer sender are ignored; a changed meaning is a new version in the topic's key.
 """
 
 from __future__ import annotations
@@ -18,13 +17,12 @@ import numpy as np
 
 from birdslam.types import FrameRef, SpeedReading, Status
 
-# A message is a few kB. With its attachment it must pass zenoh's filter (bus.py, 65,000 B), which drops silently.
-MAX_MESSAGE_BYTES = 64_000
+MAX_MESSAGE_BYTES = 64_000  # with the attachment below zenoh's filter (transport/session.py), which drops silently
 MAX_TRACE_BYTES = 900
 _MAX_TEXT_BYTES = 1_000
 _MAX_ITEMS = 10_000
 
-_MAY_BE_NAN: dict[type, frozenset[str]] = {  # record -> its fields of any numbers
+_MAY_BE_NAN: dict[type, frozenset[str]] = {  # record -> fields that may be non-finite
     SpeedReading: frozenset(SpeedReading.__struct_fields__),
     FrameRef: frozenset({"speeds"}),
 }
@@ -35,45 +33,45 @@ _NodeName = Annotated[str, msgspec.Meta(max_length=32)]
 
 
 class WireError(ValueError):
-    """Bytes that are no valid record, or a record that can't become a message; says why."""
+    """The bytes are no valid record, or the record can't be encoded; the message has the reason."""
 
 
 class Stage(msgspec.Struct, frozen=True, array_like=True):
-    """What one node did with a message, on CLOCK_MONOTONIC: received it, finished its step, sent the result."""
+    """The processing of a message by one node, on CLOCK_MONOTONIC."""
 
     node: _NodeName
-    received_ns: int  # taken up
-    done_ns: int
+    received_ns: int  # start of the step
+    done_ns: int  # end of the step
     sent_ns: int = 0  # stamped by Publisher.put
-    arrived_ns: int = 0  # in the node's process: until it was taken up it waited in the queue; 0: nobody said
+    arrived_ns: int = 0  # arrival in the node's queue; 0: unknown
 
 
 class Trace(msgspec.Struct, frozen=True):
-    """Where a message's time went; travels as the attachment, so that the payload's bytes stay deterministic."""
+    """The stages of a message; sent as the attachment, so that the payload is deterministic."""
 
-    stages: Annotated[tuple[Stage, ...], msgspec.Meta(max_length=8)] = ()  # in the order of the way
-    left_ns: int | None = None  # of the budget end to end when an estimate was done; negative: it is late
-    number: _Count = 0  # of this message among its publisher's, from 1 on: a gap means that some were lost
+    stages: Annotated[tuple[Stage, ...], msgspec.Meta(max_length=8)] = ()  # in order
+    left_ns: int | None = None  # rest of the end-to-end budget when the estimate was done; negative: it is late
+    number: _Count = 0  # of this message, counted by its publisher from 1; a gap means lost messages
 
     def after(self, node: str, received_ns: int, done_ns: int, arrived_ns: int = 0) -> Trace:
-        """The trace of what `node` made of this message: one stage more."""
+        """Returns the trace with a stage of `node` added."""
         return Trace((*self.stages, Stage(node, received_ns, done_ns, arrived_ns=arrived_ns)))
 
     def sent(self, sent_ns: int, number: int) -> Trace:
-        """The trace with the sending of its last stage stamped, as its publisher's message of this number."""
+        """Returns the trace with the time of sending in its last stage, and the message's number."""
         *earlier, last = self.stages
         return Trace((*earlier, msgspec.structs.replace(last, sent_ns=sent_ns)), self.left_ns, number)
 
 
 class Part(msgspec.Struct, frozen=True, array_like=True):
-    """Which of the answer's messages this is: one is too small for a long drive. Travels as their attachment."""
+    """The position of a message in a reply of several messages; sent as the attachment."""
 
-    number: Annotated[int, msgspec.Meta(ge=0)] = 0  # from 0 on
-    of: Annotated[int, msgspec.Meta(ge=1, le=256)] = 1  # so many in all
+    number: Annotated[int, msgspec.Meta(ge=0)] = 0  # from 0
+    of: Annotated[int, msgspec.Meta(ge=1, le=256)] = 1  # total number of messages
 
 
 class Spread(msgspec.Struct, frozen=True, array_like=True):
-    """Of durations in the last seconds, in ms; all zero where there were none."""
+    """Percentiles of durations in the last seconds, in ms; zero without data."""
 
     p50_ms: float = 0.0
     p95_ms: float = 0.0
@@ -82,53 +80,50 @@ class Spread(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Health(msgspec.Struct, frozen=True, kw_only=True):
-    """A node -> supervisor and planners, about once a second: what it has done since it started."""
+    """A node -> supervisor and planners, about once a second: its statistics since its start."""
 
     node: _NodeName
     t_ns: int  # CLOCK_MONOTONIC
     frames: _Count = 0  # records finished
-    dropped: _Count = 0  # records that were replaced or dropped before this node took them up
-    malformed: _Count = 0  # messages that were no records
+    dropped: _Count = 0  # records that were replaced or dropped before this node processed them
+    malformed: _Count = 0  # invalid messages
     torn: _Count = 0  # frames whose pixels were overwritten before they were read
     rate_hz: float = 0.0  # of `frames`, since the last Health
-    wait: Spread = Spread()  # from sent to taken up; capture: from its due time
-    step: Spread = Spread()  # from taken up to done
-    age: Spread = Spread()  # from the frame's capture to done
-    overruns: _Count = 0  # steps over this node's budget, with the record's wait in the queue
-    late: _Count = 0  # records that took longer than the budget of their hop to arrive here
+    wait: Spread = Spread()  # from sending to the start of the step; capture: from its due time
+    step: Spread = Spread()  # duration of the step
+    age: Spread = Spread()  # from the frame's capture to the end of the step
+    overruns: _Count = 0  # steps over this node's budget, including the wait in its queue
+    late: _Count = 0  # records that arrived later than the budget of their hop
     rss_bytes: _Count = 0
     cpu_percent: float = 0.0  # of one core, since the last Health
     mode: str = "full"  # of perceive: full, rate, boxes, odometry or coasting
     restarts: _Count = 0  # of this node in this run
     cause: Annotated[str, msgspec.Meta(max_length=200)] = ""  # of the last restart
-    status: tuple[Status, ...] = ()  # INPUT_STALE: this node has received nothing for too long
-    coasted: _Count = 0  # of optimize: frames that it had to estimate without measurements
-    outrun: _Count = 0  # of optimize: measurements that came when a newer frame had been coasted over
-    looks: _Count = 0  # of perceive: frames on which a network was begun
-    speeds: _Count = 0  # of capture: readings of the car's own speed that have come on the bus
-    speeds_dropped: _Count = 0  # of capture: of them, those beyond what a frame bears, and those lost on their way
+    status: tuple[Status, ...] = ()  # INPUT_STALE: no input for too long
+    coasted: _Count = 0  # of optimize: frames estimated without measurements
+    outrun: _Count = 0  # of optimize: measurements that arrived after a newer frame was predicted
+    looks: _Count = 0  # of perceive: frames on which a network ran
+    speeds: _Count = 0  # of capture: readings of the car's own speed received from the bus
+    speeds_dropped: _Count = 0  # of capture: lost readings, in transit or over the limit of a frame
 
 
 def _plain(value: Any) -> Any:
     if isinstance(value, np.generic):
         return value.item()
-    raise TypeError(f"{type(value).__name__} has no place in a message")
+    raise TypeError(f"{type(value).__name__} is not allowed in a message")
 
 
-def _may_hold_others(data: bytes) -> bool:
-    """Whether MessagePack may hold a number that is not finite: where none of its bytes look like one, none does.
-
-    Quicker than to walk all numbers by a factor of ten or more, and nearly always enough.
-    """
+def _may_have_nonfinite(data: bytes) -> bool:
+    """Whether MessagePack may have a non-finite number, by its byte patterns; a fast test before `_check_finite`."""
     byte = np.frombuffer(data, np.uint8)
-    exponent = np.flatnonzero((byte[1:-1] & 0x7F) == 0x7F)  # all its bits are set, whatever the sign
+    exponent = np.flatnonzero((byte[1:-1] & 0x7F) == 0x7F)  # all bits are set
     head, third = byte[exponent], byte[exponent + 2]
     found = ((head == 0xCB) & (third >= 0xF0)) | ((head == 0xCA) & (third >= 0x80))  # of 64 and of 32 bits
     return bool(found.any())
 
 
 def _check_finite(plain: Any, record: type) -> None:
-    """Whatever a record itself checks, no NaN and no infinity passes the wire, in either direction."""
+    """Raises ValueError for a NaN or an infinity outside _MAY_BE_NAN."""
     waiting = [plain]
     if record in _MAY_BE_NAN and isinstance(plain, dict):
         waiting = [value for field, value in plain.items() if field not in _MAY_BE_NAN[record]]
@@ -144,10 +139,10 @@ def _check_finite(plain: Any, record: type) -> None:
 
 
 def encode(record: msgspec.Struct) -> bytes:
-    """The record as one MessagePack map; the same record gives the same bytes. Raises WireError where it can't."""
+    """Encodes the record as one MessagePack map, deterministically. Raises WireError if that fails."""
     try:
         data = msgspec.msgpack.encode(record, enc_hook=_plain)
-        if _may_hold_others(data):
+        if _may_have_nonfinite(data):
             _check_finite(msgspec.to_builtins(record, enc_hook=_plain), type(record))
     except (ValueError, TypeError, OverflowError) as error:
         raise WireError(f"{type(record).__name__} can't be encoded: {error}") from error
@@ -156,23 +151,23 @@ def encode(record: msgspec.Struct) -> bytes:
     return data
 
 
-_LEARNED: set[type[msgspec.Struct]] = set()  # by msgspec, which looks at a type's fields when it is first asked for it
-_LEARNING = threading.Lock()
+_converted_types: set[type[msgspec.Struct]] = set()
+_first_conversion = threading.Lock()
 
 
-def _converted(plain: Any, record: type[_Record]) -> _Record:
-    """`plain` as a record. msgspec crashes where two threads ask it for the same new type at once."""
-    if record in _LEARNED:
+def _convert(plain: Any, record: type[_Record]) -> _Record:
+    """Converts to a record. msgspec crashes if two threads convert to the same new type concurrently."""
+    if record in _converted_types:
         return msgspec.convert(plain, record)
-    with _LEARNING:
+    with _first_conversion:
         try:
             return msgspec.convert(plain, record)
         finally:
-            _LEARNED.add(record)
+            _converted_types.add(record)
 
 
 def decode(data: bytes, record: type[_Record], max_bytes: int = MAX_MESSAGE_BYTES) -> _Record:
-    """The record in `data`. Raises WireError, and nothing else, where `data` is not exactly one valid `record`."""
+    """Decodes a record. Raises WireError, and nothing else, if `data` is not exactly one valid `record`."""
     if len(data) > max_bytes:
         raise WireError(f"{record.__name__}: {len(data)} B are over the limit of {max_bytes} B")
     try:
@@ -184,8 +179,8 @@ def decode(data: bytes, record: type[_Record], max_bytes: int = MAX_MESSAGE_BYTE
             max_array_len=_MAX_ITEMS,
             max_map_len=_MAX_ITEMS,
         )
-        if _may_hold_others(data):
+        if _may_have_nonfinite(data):
             _check_finite(plain, record)
-        return _converted(plain, record)
+        return _convert(plain, record)
     except (ValueError, OverflowError, RecursionError, msgpack.UnpackException) as error:
         raise WireError(f"{record.__name__}: {str(error) or type(error).__name__}") from error

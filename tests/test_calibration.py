@@ -418,7 +418,7 @@ def test_a_stated_height_that_cars_contradict_is_kept_with_a_sigma_that_covers_b
     camera, by = with_height(calibrated(1.35, (cars,)), True, None, "video:town.mp4")
     assert camera.height_m == 1.35
     assert camera.scale_sigma_rel == pytest.approx(math.log(1.35 / 0.95))
-    assert "12 cars says 0.95 m" in by.contradicted_by
+    assert "12 cars gives 0.95 m" in by.contradicted_by
     rests_on = lengths_by(camera, by, None)
     (told,) = (said for said in verdict(counts(rests_on)) if "contradicted" in said)
     assert "0.95 m" in told

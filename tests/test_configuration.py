@@ -42,18 +42,18 @@ def test_differences_only(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "key", "reason"),
     [
-        ("[source]\npace = 3\n", "source.pace", "there is no such key"),
-        ("[slam.graph]\nlagg = 3\n", "slam.graph.lagg", "there is no such key"),
+        ("[source]\npace = 3\n", "source.pace", "no such key"),
+        ("[slam.graph]\nlagg = 3\n", "slam.graph.lagg", "no such key"),
         ("[source]\nstrides = 3\n", "source.strides", "; the nearest is source.stride"),
         ("[sourc]\nstride = 3\n", "sourc", "; the nearest is source"),
-        ("colour = 1\n", "colour", "there is no such key"),
+        ("colour = 1\n", "colour", "no such key"),
         ('[source]\nstride = "two"\n', "source.stride", "Expected `int`, got `str`"),
         ("[source]\nstride = 0\n", "source.stride", ">= 1"),
         ("[source]\nrate = -1.0\n", "source.rate", "> 0"),
         ('[source]\nrate = "fast"\n', "source.rate", "fast"),
         ('vehicle = "a/b"\n', "vehicle", "matching regex"),
         ("source = 5\n", "source", "Expected `object`"),
-        ('[models.detektor]\npath = "x"\n', "models.detektor", "there is no such key; the nearest is models.detector"),
+        ('[models.detektor]\npath = "x"\n', "models.detektor", "no such key; the nearest is models.detector"),
         ("[camera]\nwidth_px = 64\n", "camera", "missing required field"),
         (f"[camera]\n{CAMERA.replace('1.5', '15.0')}", "camera", "height_m = 15.0"),
     ],
@@ -139,7 +139,7 @@ def test_overrides_go_over_the_file_and_are_named(tmp_path: Path) -> None:
     assert configuration.models.detector == ModelSpec("net.onnx", every=3)
     with pytest.raises(ConfigurationError, match=r"^command line: source\.stride: "):
         load(path, {"source.stride": "two"})
-    with pytest.raises(ConfigurationError, match=r"^command line: source\.stride\.deep: stride is no table"):
+    with pytest.raises(ConfigurationError, match=r"^command line: source\.stride\.deep: stride is not a table"):
         load(path, {"source.stride.deep": 1})
     with pytest.raises(ConfigurationError, match=r"a\.toml: models\.detector: .*path"):
         load(path)
@@ -210,7 +210,7 @@ def test_a_constant_in_a_file_is_refused_and_its_place_named(tmp_path: Path, tex
     with pytest.raises(ConfigurationError) as error:
         load(path)
     message = str(error.value)
-    assert message.startswith(f"{path}: {key}: is a constant now and no key any more: field {key.split('.')[-1]} of ")
+    assert message.startswith(f"{path}: {key}: is a constant, not a key: field {key.split('.')[-1]} of ")
     assert place in message
     assert f"--constant {key}=VALUE" in message
 
@@ -228,7 +228,7 @@ def test_a_constant_goes_over_all_else() -> None:
     assert (made.slam.graph.forget_s, made.slam.graph.ego_nodes) == (3.0, 6)
     with pytest.raises(ConfigurationError, match=r"^command line: slam\.graph\.ego_nodes: .*<= 64"):
         load(None, constants={"slam.graph.ego_nodes": 65})
-    with pytest.raises(ConfigurationError, match="there is no such key"):
+    with pytest.raises(ConfigurationError, match="no such key"):
         load(None, constants={"slam.graph.egos": 6})
 
 

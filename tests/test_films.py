@@ -243,7 +243,7 @@ def test_what_is_no_film_is_one_clear_line(tmp_path: Path, capfd: pytest.Capture
         ("timeless.mp4", "neither its container nor its frames tell a usable frame rate (nan)"),
         ("other", "has no films (.mp4,"),
         ("two", "2.mp4: is 64x64, but the camera given is 96x64"),
-        (one.name, "its images do not show its lens"),
+        (one.name, "its images do not determine the lens"),
     ):
         arguments = ["run", "--source", f"video:{tmp_path / name}", "--model", "none", "--fov", "60"]
         assert main([*arguments, "--height", "1.4", "--output", str(tmp_path / "out")]) == 2, name

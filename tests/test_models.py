@@ -114,7 +114,7 @@ def test_a_configuration_file_may_name_models_and_their_directory(tmp_path: Path
     path.write_text('[runtime]\nmodels_dir = "elsewhere"\n[models.segmenter]\npath = "seg"\nevery = 4\n')
     made = configuration_of(parse(["run", str(path)]))
     assert made.models.segmenter == ModelSpec(str(elsewhere / "seg" / "seg.onnx"), every=4)
-    with pytest.raises(ConfigurationError, match=r"no model 'det': at hand are .*seg"):
+    with pytest.raises(ConfigurationError, match=r"no model 'det': available are .*seg"):
         configuration_of(parse(["run", str(path), "--model", "det"]))
 
 
@@ -248,7 +248,7 @@ def test_a_name_of_the_catalogue_is_fetched_and_pinned(
         catalogue(tmp_path, monkeypatch, server[1], network, manifest="one", size_bytes=10)
         assert "over the limit of 10" in refused(capsys, "add", "net")
         catalogue(tmp_path, monkeypatch, server[1], network, manifest="one", path="gone.onnx")
-        assert "gone.onnx: the server says 404" in refused(capsys, "add", "net")
+        assert "gone.onnx: the server returned 404" in refused(capsys, "add", "net")
     assert left_in(store) == {"net"}
     assert "which has net" in refused(capsys, "add", "nowhere")
 
@@ -258,7 +258,7 @@ def test_an_address_needs_a_hash_and_brings_its_manifest(
 ) -> None:
     root, address = server
     network = segmenter(root)
-    assert "no SHA-256 is known for it" in refused(capsys, "add", f"{address}/seg.onnx")
+    assert "its SHA-256 is unknown" in refused(capsys, "add", f"{address}/seg.onnx")
     assert left_in(store) == set()
     assert main(["models", "add", f"{address}/seg.onnx", "--sha256", sha256(network).upper()]) == 0
     network.with_suffix(".toml").write_text(f'sha256 = "{sha256(network)}"\n{SEGMENTER}')
@@ -287,9 +287,9 @@ def test_a_download_is_whole_or_not_there(tmp_path: Path) -> None:
     target = tmp_path / "file"
     for _, address in serve(Liar, tmp_path):
         for path, named in (
-            ("short", "broke off after 100 of 1000"),
+            ("short", "interrupted after 100 of 1000"),
             ("long", "more than the limit"),
-            ("away", "leads to ftp"),
+            ("away", "redirects to ftp"),
         ):
             with pytest.raises(DownloadError, match=named):
                 download(f"{address}/{path}", target, 1000, 5.0, lambda *n: seen.append(n))

@@ -368,7 +368,7 @@ def place(odometry: Any) -> float:
 def test_a_listener_hears_each_message_and_again_after_the_router_was_gone(join: Any, base: Path) -> None:
     port = free_port()
     with ExitStack() as stack:
-        with pytest.raises(NoRouter, match=f"ros.router tcp/127.0.0.1:{port}: the router is not there"):
+        with pytest.raises(NoRouter, match=f"ros.router tcp/127.0.0.1:{port}: the router is not reachable"):
             RosNode(RosConfig(router=f"tcp/127.0.0.1:{port}"), "birdslam", timeout_s=0.2)
         with peer("router", str(port)):
             vehicle = Vehicle(join, base, port, domain=4)
@@ -519,10 +519,10 @@ def test_a_source_without_images_says_why(tmp_path: Path) -> None:
     port = free_port()
     asked = configuration(port, tmp_path)
     short = msgspec.structs.replace(asked, source=msgspec.structs.replace(asked.source, camera_timeout_s=0.5))
-    with pytest.raises(SourceError, match="the router is not there"):
+    with pytest.raises(SourceError, match="the router is not reachable"):
         open_source(short)
     with peer("router", str(port)):
-        with pytest.raises(SourceError, match="nobody publishes /front/image in domain 0"):
+        with pytest.raises(SourceError, match="/front/image has no publisher in domain 0"):
             open_source(short)
         with peer("car", str(port), "0", "demo", "20"):
             other = msgspec.structs.replace(asked.source, uri="ros:/front/camera_info")
@@ -584,6 +584,6 @@ def test_while_the_router_is_gone_frames_say_so_and_then_images_come_again(tmp_p
         router.close()
         said = next(frame.error for frame in frames if frame.image is None)
         assert "no image for" in str(said)
-        until(lambda: "the router is not there" in str(next(frames).error), "it does not say that the router is gone")
+        until(lambda: "the router is not connected" in str(next(frames).error), "it does not say that the router is gone")
         stack.enter_context(peer("router", str(port)))
         until(lambda: next(frames).image is not None, "no image comes again")

@@ -64,9 +64,9 @@ def test_lanes_are_made_out_five_times_a_second_unless_it_is_said_otherwise(rate
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("detector = { every = 2, hz = 3 }", "every and hz say the same"),
-        ("lanes = { awaited = true }", "perceive.schedule.lanes.awaited: there is no such key"),
-        ("pointnet = { every = 2 }", "perceive.schedule.pointnet: there is no such key"),
+        ("detector = { every = 2, hz = 3 }", "every and hz exclude each other"),
+        ("lanes = { awaited = true }", "perceive.schedule.lanes.awaited: no such key"),
+        ("pointnet = { every = 2 }", "perceive.schedule.pointnet: no such key"),
         ("detector = { every = 0 }", "perceive.schedule.detector.every"),
     ],
 )

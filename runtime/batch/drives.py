@@ -104,9 +104,7 @@ def _uri_of_url(url: str) -> str:
     """Returns the URI of the source at a URL, by its file name. Raises ConfigurationError for an unknown suffix."""
     scheme = by_suffix(Path(url), all_schemes())
     if scheme is None:
-        raise ConfigurationError(
-            f"{url}: unknown kind of source; name it, as in {ROSBAG.name}:{url} or {MCAP.name}:{url}"
-        )
+        raise ConfigurationError(f"{url}: unknown suffix; name the kind: {ROSBAG.name}:{url} or {MCAP.name}:{url}")
     return f"{scheme.name}:{url}"
 
 

@@ -1,4 +1,4 @@
-"""A camera from a drive: intrinsics read or measured, pitch and roll estimated, the height checked."""
+"""Calibrates a camera from a drive: intrinsics read or estimated, pitch and roll estimated, the height checked."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ from birdslam.runtime.progress import with_progress
 from birdslam.sources.recording import DatasetError, Recording
 from birdslam.types import Frame
 
-# For a drive that follows at once: it looks for the tilt itself, and begins from what the first pass knows
+# For a first pass: the run that follows estimates the tilt again
 ROUGH = CalibrationConfig(max_sigma_rad=0.05, max_sigma_roll_rad=0.1)
-LEVEL_SIGMA_RAD = 0.035  # of pitch and roll where the drive shows neither: two degrees, by judgement
-_MOUNT_S = 180.0  # of a film, from which pitch, roll and height are found
+LEVEL_SIGMA_RAD = 0.035  # prior of pitch and roll: two degrees, by judgement
+_MOUNT_S = 180.0  # part of a video used for pitch, roll and height
 
 
 class Calibrated(NamedTuple):
-    """A camera, and what it rests on, a line each; `lengths_by` is what its metres rest on."""
+    """A camera with its report, and the source of its metric scale (`lengths_by`)."""
 
     camera: Camera
     report: list[str]
@@ -57,10 +57,10 @@ def calibrate_drive(
     config: CalibrationConfig = CalibrationConfig(),  # noqa: B008
     must_show: bool = True,
 ) -> Calibrated:
-    """The camera of a drive. `source`: a KITTI directory or a source's URI.
+    """Calibrates the camera of a drive. `source`: a KITTI directory or a source's URI.
 
-    Without `must_show` what the drive does not show (rain, a truck ahead) is assumed, with its sigma, and the report
-    says so. Raises CalibrationError, ConfigurationError, DatasetError.
+    Without `must_show` quantities that the drive does not determine get a prior with its sigma, named in the report.
+    Raises CalibrationError, ConfigurationError, DatasetError.
     """
     uri = recording_uri(source)
     topics = configuration.source.topics
@@ -78,12 +78,12 @@ def calibrate_drive(
     if pitch is not None:
         recording.camera = msgspec.structs.replace(recording.camera, pitch_rad=pitch.pitch_rad)
     readout: Readout | None = None
-    # The rows of a sensor are columns of the film that a phone took upright
+    # In a portrait video the rows of the sensor are columns of the image
     if is_film and recording.camera.width_px >= recording.camera.height_px:
         corners = corners or corners_of_drive(configuration, uri, recording.camera, stride)
         readout = readout_of_drive(corners, recording.camera, focal_sigma_rel(lens), k1_sigma)
         recording.camera = msgspec.structs.replace(recording.camera, readout_s=readout.readout_s)
-    known_height = height_m is not None or lens is None  # a recording with a calibration of its own says the height
+    known_height = height_m is not None or lens is None  # a recording with its own calibration has the height
     cv2.setNumThreads(configuration.perceive.opencv_threads)
     configuration = configuration.as_lossless()
     with Inference(configuration) as inference:
@@ -111,7 +111,7 @@ def calibrate_drive(
 
 
 def _assumed(camera: Camera, pitch: TravelPitch | None, why: str) -> Calibration:
-    """A camera that looks level, but for the pitch that its way shows: the road does not show how it is mounted."""
+    """Returns a level camera, or one with the pitch of its direction of travel, if the road does not show the tilt."""
     level = TravelPitch(0.0, LEVEL_SIGMA_RAD)
     pitch_rad, sigma_rad = pitch or level
     camera = msgspec.structs.replace(camera, pitch_rad=pitch_rad, roll_rad=0.0, tilt_sigma_rad=LEVEL_SIGMA_RAD)
@@ -124,7 +124,7 @@ def _assumed(camera: Camera, pitch: TravelPitch | None, why: str) -> Calibration
         path_m=0.0,
         frames=0,
         speed_mps=0.0,
-        assumed=f"its pitch by the way it travels, no roll: {why}" if pitch else f"that it looks level: {why}",
+        assumed=f"pitch from the direction of travel, no roll: {why}" if pitch else f"a level camera: {why}",
     )
 
 
@@ -136,10 +136,10 @@ def _open(uri: str, lens: Intrinsics | None, height_m: float | None, stride: int
         return recording
     width_px, height_px = lens.width_px, lens.height_px
     if width_px is None or height_px is None:
-        calibrated = parsed(uri)[0].camera in ("calibration", "intrinsics")  # of a film it could be any size
+        calibrated = parsed(uri)[0].camera in ("calibration", "intrinsics")  # a video may have any size
         size = frame_size(uri, topics) if calibrated else None
         if size is None:
-            raise DatasetError(f"{lens.source}: does not say for which size of image it is")
+            raise DatasetError(f"{lens.source}: has no image size")
         width_px, height_px = size
     try:
         camera = Camera(

@@ -1,4 +1,4 @@
-"""What is known of a camera beside its drive: intrinsics, lengths, and how wide it may see."""
+"""Prior knowledge of a camera: intrinsics, lengths, field of view."""
 
 from __future__ import annotations
 
@@ -21,29 +21,29 @@ from birdslam.runtime.nodes.sources import parsed
 from birdslam.sources.camera_file import load_camera
 from birdslam.sources.recording import DatasetError, Recording
 
-METADATA_SIGMA_REL = 0.1  # of a focal length by metadata: a film often shows less than the sensor sees; by judgement
+METADATA_SIGMA_REL = 0.1  # of a focal length from metadata, since videos are often cropped; by judgement
 
 
 @dataclass(frozen=True)
 class Given:
-    """What is known of the camera beside the drive: intrinsics from at most one of the first three, and lengths."""
+    """The user's input about the camera: intrinsics from at most one of the first three, and lengths."""
 
-    camera: Path | None = None  # an older camera file
+    camera: Path | None = None  # an existing camera file
     intrinsics: Path | None = None  # a calibration file of another project
     chessboard: Path | None = None  # a directory of images
     board: tuple[int, int] = (9, 6)  # the chessboard's inner corners: columns, rows
     square_m: float = 0.025
     height_m: float | None = None
-    fov_deg: float | None = None  # across the image, of a lens that nothing else tells
-    kind: str = "dashcam"  # of the camera, where not even that is known
+    fov_deg: float | None = None  # horizontal field of view, for an unknown lens
+    kind: str = "dashcam"  # kind of camera, if the field of view is unknown too
     speed: Path | None = None  # lines of time in s, speed in m/s
 
 
 def lens_of(given: Given, uri: str, topics: BagTopics) -> tuple[Intrinsics | None, float | None]:
-    """Intrinsics from elsewhere than the recording, and the height that the user states."""
+    """Returns the intrinsics, if known before the drive, and the stated height."""
     height_m = given.height_m
     if height_m is not None and not 0.2 <= height_m <= 5.0:
-        raise ConfigurationError(f"--height {height_m:g}: a camera is 0.2 to 5 m above the road")
+        raise ConfigurationError(f"--height {height_m:g}: expected 0.2 to 5 m above the road")
     if given.camera is not None:
         old = load_camera(given.camera)
         numbers = {name: getattr(old, name) for name in ("fx_px", "fy_px", "cx_px", "cy_px", "distortion", "fisheye")}
@@ -61,27 +61,27 @@ def lens_of(given: Given, uri: str, topics: BagTopics) -> tuple[Intrinsics | Non
 
 
 class FocalLength(NamedTuple):
-    """What is known of a focal length before the drive, with its 1-sigma as a fraction, and by what."""
+    """The prior of a focal length: value, 1-sigma as a fraction, and source."""
 
     px: float
     sigma_rel: float
     by: str
-    by_view: bool = True  # of the image across, of which nobody says whether the lens's distortion is counted
-    fisheye: bool = False  # about equidistant: no pinhole sees so far
+    by_view: bool = True  # from a horizontal field of view, which may or may not include distortion
+    fisheye: bool = False  # about equidistant: too wide for a pinhole model
 
 
 def focal_length_of(given: Given, uri: str, width_px: int) -> FocalLength:
-    """As stated, by the film's metadata, or by the kind of camera. Raises ConfigurationError."""
+    """Returns the focal length as stated, from metadata, or from the kind of camera. Raises ConfigurationError."""
     if given.fov_deg is not None:
         if not 10.0 <= given.fov_deg <= 150.0:
-            raise ConfigurationError(f"--fov {given.fov_deg:g}: is no field of view of a camera here (10 to 150 deg)")
+            raise ConfigurationError(f"--fov {given.fov_deg:g}: expected a field of view of 10 to 150 deg")
         words, fisheye = f"as stated, {given.fov_deg:g} deg across", given.fov_deg >= WIDE_DEG
         focal_px = focal_by_field_of_view(width_px, given.fov_deg, fisheye)
         return FocalLength(focal_px, WIDE_SIGMA_REL if fisheye else STATED_SIGMA_REL, words, fisheye=fisheye)
     kind, path = class_and_path(uri)
     stated_px = kind.stated_focal_px(path)
     if stated_px is not None and focal_by_field_of_view(width_px, 150.0) < stated_px:
-        by = f"that of the film's own metadata, {stated_px:.0f} px"
+        by = f"from the video's metadata, {stated_px:.0f} px"
         return FocalLength(stated_px, METADATA_SIGMA_REL, by, by_view=False)
     fov_deg, sigma_rel = FIELD_OF_VIEW_DEG[given.kind]
     focal_px = focal_by_field_of_view(width_px, fov_deg)
@@ -89,15 +89,15 @@ def focal_length_of(given: Given, uri: str, width_px: int) -> FocalLength:
 
 
 def class_and_path(uri: str) -> tuple[type[Recording], Path]:
-    """The class that reads a source's URI, and the path in it."""
+    """Returns the class that reads a source's URI, and its path."""
     scheme, address = parsed(uri)
     return scheme.load(), Path(address).expanduser()
 
 
 def frame_size(uri: str, topics: BagTopics) -> tuple[int, int] | None:
-    """(width, height) in pixels of the recording's frames; None where it is unknown."""
+    """Returns (width, height) of the recording's frames in pixels; None if unknown."""
     kind, path = class_and_path(uri)
     try:
         return kind.frame_size(path, topics)
-    except DatasetError:  # opening it says what is wrong
+    except DatasetError:  # opening it raises the error
         return None

@@ -1,4 +1,4 @@
-"""The lens of a film that says nothing of its camera, by what its images show."""
+"""Estimates the lens of a video without camera data from its images."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from birdslam.runtime.nodes.sources import RecordedSource, offline_frames, open_
 from birdslam.runtime.progress import with_progress
 from birdslam.types import NS_PER_S
 
-_LENS_S = 120.0  # of a film, from which its lens is found
+_LENS_S = 120.0  # part of a video used for its lens
 
 
 class LensOfDrive(NamedTuple):
-    """A lens, the corners that it is from, 1-sigma of its k1, and the pitch by the way driven, where they show it."""
+    """A lens, the corners behind it, 1-sigma of its k1, and the pitch from the direction of travel if observable."""
 
     lens: Intrinsics
     corners: list[CornersOfImage]
@@ -42,9 +42,9 @@ class LensOfDrive(NamedTuple):
 def lens_of_drive(
     configuration: Configuration, uri: str, given: Given, size_px: tuple[int, int], stride: int, must_show: bool = True
 ) -> LensOfDrive:
-    """The lens of a film that says nothing of its camera, by what its images show.
+    """Estimates the lens of a video from its images.
 
-    Raises CalibrationError where they do not show it; without `must_show` it is then what is known beforehand.
+    Raises CalibrationError if they do not determine it; without `must_show` it then returns the prior.
     """
     width_px, height_px = size_px
     known = focal_length_of(given, uri, width_px)
@@ -61,7 +61,7 @@ def lens_of_drive(
     if lens is None and not must_show and len(corners) >= IMAGES:
         k1 = 0.0 if bend is None else k1_by_bend(bend, focal_px / width_px)[0]
         shape = (
-            "equidistant" if known.fisheye else "no distortion" if bend is None else f"k1 {k1:+.3f} by upright lines"
+            "equidistant" if known.fisheye else "no distortion" if bend is None else f"k1 {k1:+.3f} from vertical edges"
         )
         assumed = Intrinsics(
             fx_px=focal_px,
@@ -72,19 +72,19 @@ def lens_of_drive(
             fisheye=known.fisheye,
             width_px=width_px,
             height_px=height_px,
-            source=f"assumed, since the drive does not show it: focal length {focal_px:.0f} px +- {sigma_rel:.0%}, "
+            source=f"assumed, not determined by the drive: focal length {focal_px:.0f} px +- {sigma_rel:.0%}, "
             f"{by}; {shape}",
             sigma_focal_px=focal_px * sigma_rel,
         )
         return LensOfDrive(assumed, corners, SIGMA_K1)
     if lens is None:
         raise CalibrationError(
-            f"{uri}: its images do not show its lens: the car hardly drives in its first {_LENS_S:g} s, or little is "
-            "to be seen; --intrinsics, --chessboard or --camera name a lens"
+            f"{uri}: its images do not determine the lens: the car hardly moves in the first {_LENS_S:g} s, or the "
+            "images have too little texture; name a lens with --intrinsics, --chessboard or --camera"
         )
     focal = f"focal length {lens.focal_px:.0f} px +- {lens.focal_sigma_rel:.0%}"
-    lines = f", {uprights.edges} upright lines" if bend is not None and uprights is not None else ""
-    shown = "by the drive" if lens.focal_shown else f"{by}; the drive turns too little to show it"
+    lines = f", {uprights.edges} vertical edges" if bend is not None and uprights is not None else ""
+    shown = "by the drive" if lens.focal_shown else f"{by}; the drive turns too little to estimate it"
     found = Intrinsics(
         fx_px=lens.focal_px,
         fy_px=lens.focal_px,
@@ -106,7 +106,7 @@ def lens_of_drive(
 def corners_of_drive(
     configuration: Configuration, uri: str, camera: Camera, stride: int, edges: list[Floats] | None = None
 ) -> list[CornersOfImage]:
-    """Corners of a film's raw images, outside vehicles; `edges` takes what looks upright in some of them."""
+    """Tracks corners in a video's raw images, outside vehicles; appends vertical edges of some images to `edges`."""
     configuration = configuration.as_lossless()
     raw = msgspec.structs.replace(camera, distortion=(), fisheye=False)
     recording = open_recorded(uri, raw, stride, configuration.source.topics)
@@ -128,9 +128,9 @@ def corners_of_drive(
 
 
 def with_uprights(known: FocalLength, uprights: LensByUprights | None, width_px: int) -> FocalLength:
-    """The focal length that a fisheye's upright lines show, where nobody states how wide the camera sees."""
+    """Returns the focal length from a fisheye's vertical edges, if the field of view is unknown."""
     if uprights is None or uprights.fisheye_focal is None or known.fisheye or known.sigma_rel < WIDE_SIGMA_REL:
         return known
     degrees = np.degrees(1.0 / uprights.fisheye_focal)
-    by = f"that of a fisheye {degrees:.0f} deg across, by {uprights.edges} upright lines"
+    by = f"that of a fisheye {degrees:.0f} deg across, from {uprights.edges} vertical edges"
     return FocalLength(uprights.fisheye_focal * width_px, WIDE_SIGMA_REL, by, by_view=False, fisheye=True)

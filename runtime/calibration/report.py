@@ -1,4 +1,4 @@
-"""The camera file and its report: what was found of a camera, a line each."""
+"""Writes the camera file and the report of a calibration."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ def report(
     readout: Readout | None = None,
 ) -> Iterator[str]:
     if found.assumed:
-        yield f"from {uri}: the road does not show the tilt; assumed {found.assumed}"
+        yield f"from {uri}: the road does not determine the tilt; assumed {found.assumed}"
     else:
         yield f"from {uri}: {found.frames} frames, {found.path_m:.0f} m"
     source = "the recording" if lens is None else lens.source
     error = "" if lens is None or lens.reprojection_px is None else f", reprojection {lens.reprojection_px:.2f} px"
     yield f"intrinsics: {source}{error}"
     for reason in () if lens is None else lens.left_out:
-        yield f"  left out: {reason}"
+        yield f"  ignored: {reason}"
     sigma = np.degrees(np.sqrt(np.diag(np.reshape(found.cov, (2, 2)))))
     pitch_deg, roll_deg = np.degrees([camera.pitch_rad, camera.roll_rad])
     yield f"pitch {pitch_deg:+.2f} +- {sigma[0]:.2f} deg, roll {roll_deg:+.2f} +- {sigma[1]:.2f} deg"
@@ -45,14 +45,14 @@ def report(
             f"(of {estimate.samples}, chi2 {estimate.chi2:.1f})"
         )
     if found.yaw_rad is not None:
-        yield f"optical axis {np.degrees(found.yaw_rad):+.2f} deg left of the way driven (for information)"
+        yield f"optical axis {np.degrees(found.yaw_rad):+.2f} deg left of the direction of travel (for information)"
     yield f"height {camera.height_m:.3f} m, {height_by.words}"
     if height_by.contradicted_by:
         yield f"  CONTRADICTED: {height_by.contradicted_by}; the sigma below covers both"
     if readout is not None:
         yield from _rows(readout, height_by, found.speed_mps)
     if camera.scale_sigma_rel:
-        yield f"all lengths +- {camera.scale_sigma_rel:.0%}, by all of these (scale_sigma_rel)"
+        yield f"all lengths +- {camera.scale_sigma_rel:.0%} (scale_sigma_rel)"
     for check in found.height_checks:
         if check in height_by.checks:
             continue
@@ -61,15 +61,15 @@ def report(
         verdict = "agrees" if away < AGREES_SIGMA else f"DISAGREES ({away:.1f} sigma)"
         yield f"  by {check.cue}: {check.height_m:.2f} m +- {sigma_rel:.0%} (of {check.samples}): {verdict}"
     if not found.height_checks:
-        yield "  not checked: neither poses nor a speed nor enough vehicles or painted lanes were there"
+        yield "  not checked: no poses, no speed, and too few vehicles and lane markings"
 
 
 def _rows(readout: Readout, height_by: HeightBy, speed_mps: float) -> Iterator[str]:
-    """How long the camera takes to read its rows, by what, and what that leaves of all lengths."""
-    leaves = f", which leaves +- {height_by.shutter_rel:.1%} at {speed_mps:.0f} m/s" if height_by.shutter_rel else ""
-    yield f"rows read in {1e3 * readout.readout_s:.0f} +- {1e3 * readout.sigma_s:.0f} ms (readout_s){leaves}"
+    """Yields the readout time of the rows, its source, and its effect on all lengths."""
+    effect = f": lengths +- {height_by.shutter_rel:.1%} at {speed_mps:.0f} m/s" if height_by.shutter_rel else ""
+    yield f"rows read in {1e3 * readout.readout_s:.0f} +- {1e3 * readout.sigma_s:.0f} ms (readout_s){effect}"
     if readout.by_drive is None:
-        yield "  as of most cameras: the drive does not show it"
+        yield "  as of most cameras: the drive does not determine it"
     else:
         by_drive_ms, sigma_ms = (1e3 * each for each in readout.by_drive)
         yield f"  by the drive {by_drive_ms:.0f} +- {sigma_ms:.0f} ms (of {readout.windows} windows)"

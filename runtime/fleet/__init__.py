@@ -1,8 +1,7 @@
-"""Many vehicles on one network: each publishes its estimates at a router, and authorised listeners receive them all.
+"""Many vehicles on one network: each publishes its estimates to a router; authorised listeners receive all of them.
 
     vehicle's bus --> [uplink] --mutual TLS--> [router] --mutual TLS--> listeners: `birdslam top --all`, Fleet
 
-`uplink` is a planner of its own vehicle's bus that forwards to the router what it receives; only queries come in.
-`router` lets each vehicle write its own keys alone. `listener` is the client of all vehicles.
-docs/deployment.md sets it up.
+`uplink` forwards from its vehicle's bus to the router; only queries come in. `router` lets each vehicle write its own
+keys only. `listener` is the client of all vehicles. docs/deployment.md describes the setup.
 """

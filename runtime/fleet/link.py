@@ -1,4 +1,4 @@
-"""A session at the fleet's router, by mutual TLS; what it needs, checked before it is opened."""
+"""Opens a zenoh session to the fleet's router with mutual TLS, after checking its configuration."""
 
 from __future__ import annotations
 
@@ -13,18 +13,16 @@ from birdslam.runtime.transport.bus import BusError
 from birdslam.runtime.transport.session import open_session
 from birdslam.runtime.wire import MAX_MESSAGE_BYTES
 
-LEASE_MS = 1_000  # who has said nothing for so long is gone
-MAX_ZENOH_BYTES = 2 * MAX_MESSAGE_BYTES + 4096  # zenoh would put together 1 GiB
+LEASE_MS = 1_000  # a silent peer is disconnected after this time
+MAX_ZENOH_BYTES = 2 * MAX_MESSAGE_BYTES + 4096  # zenoh's default is 1 GiB
 _URGENT_BATCHES = 16  # zenoh's largest
-# Of the socket, each way: the system's own would hold seconds of estimates for a listener that reads too slowly, all of
-# them old when they are read; what does not fit is dropped by the router
-_BUFFER_BYTES = 1 << 18
+_BUFFER_BYTES = 1 << 18  # of the socket, each way; the default would queue seconds of old estimates
 BUFFERS = {"so_sndbuf": _BUFFER_BYTES, "so_rcvbuf": _BUFFER_BYTES}
 _RETRY = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2}
 
 
 def settings_of(mode: str) -> dict[str, Any]:
-    """zenoh's settings that both sides have in common: TLS alone, nothing that opens or grows."""
+    """Returns the zenoh settings of both sides: TLS only, without discovery, with bounded queues."""
     return {
         "mode": mode,
         "scouting/multicast/enabled": False,
@@ -39,7 +37,7 @@ def settings_of(mode: str) -> dict[str, Any]:
 
 
 def check(table: str, config: FleetConfig | RouterConfig, address_key: str) -> None:
-    """Raises ConfigurationError, which names the key, where the address is no TLS one or a file can't be read."""
+    """Raises ConfigurationError with the key if the address is not TLS or a file can't be read."""
     address = getattr(config, address_key)
     if not address.startswith("tls/"):
         raise ConfigurationError(f"{table}.{address_key}: needs tls/HOST:PORT, got {address!r}")
@@ -50,7 +48,7 @@ def check(table: str, config: FleetConfig | RouterConfig, address_key: str) -> N
 
 
 def zenoh_config(settings: dict[str, Any]) -> zenoh.Config:
-    """The settings as zenoh takes them."""
+    """Converts the settings to zenoh's configuration."""
     config = zenoh.Config()
     for name, value in settings.items():
         config.insert_json5(name, json.dumps(value))
@@ -58,9 +56,9 @@ def zenoh_config(settings: dict[str, Any]) -> zenoh.Config:
 
 
 def open_link(config: FleetConfig, timeout_s: float) -> zenoh.Session:
-    """A session at the router, which finds it again when it was gone.
+    """Opens a session to the router, which reconnects after a loss.
 
-    Raises ConfigurationError for a table that can't be, BusError where nobody lets it in within the time.
+    Raises ConfigurationError for an invalid table, BusError without a connection in time.
     """
     check("fleet", config, "router")
     settings = settings_of("client") | {
@@ -80,5 +78,5 @@ def open_link(config: FleetConfig, timeout_s: float) -> zenoh.Session:
     try:
         return open_session(zenoh_config(settings))
     except zenoh.ZError as error:
-        reason = "is the router there, and is this certificate of its authority?"
+        reason = "check that the router runs and that its authority signed this certificate"
         raise BusError(f"fleet.router {config.router}: no connection within {timeout_s:g} s: {reason}") from error

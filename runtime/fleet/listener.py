@@ -1,7 +1,7 @@
-"""The client of a whole fleet: each vehicle's newest estimate, with alive, on time and valid as separate answers.
+"""The client of a fleet: each vehicle's newest estimate, with separate states alive, on time and valid.
 
-It keeps one message of each vehicle, the newest, and decodes it when it is read: whoever reads slowly reads less and
-newer, and a vehicle that floods takes nothing from the others, which are read in turn.
+It stores the newest message of each vehicle and decodes it on reading; vehicles are read in turn, so that a flood of
+one does not affect the others.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from birdslam.runtime.transport.reply_parts import whole_map, whole_trajectory
 from birdslam.runtime.transport.session import close_session
 from birdslam.runtime.wire import Health, WireError, decode
 
-MAX_VEHICLES = 1_000  # of those that are not expected: what more says something is counted, not kept
-_SWEEPS = 4  # so often within max_age_ms it is looked who has fallen silent
+MAX_VEHICLES = 1_000  # unexpected ones; messages of more are counted and dropped
+_SWEEPS = 4  # checks for silent vehicles per max_age_ms
 
 __all__ = ["Fleet", "FleetReading", "Received"]
 
@@ -40,21 +40,21 @@ class Fleet(Closing):
 
         here = FleetConfig(router="tls/10.0.0.1:7448", ca="ca.pem", certificate="operator.pem", key="operator.key")
         with Fleet(here) as fleet:
-            for reading in fleet.estimates(max_age_ms=500):    # of any vehicle; each as it comes, or that none came
+            for reading in fleet.estimates(max_age_ms=500):    # each estimate on arrival, and each missing one
                 if not reading.usable:
                     look_after(reading.vehicle)                # not alive, not on time, or not valid
         for reading in fleet.readings(max_age_ms=500):         # or the newest one of each, whenever you need them
 
-    Vehicles that `config.vehicles` names are reported from the beginning, others once a message of them has come.
-    Raises ConfigurationError for a table that can't be, BusError where no router lets it in within `timeout_s`.
+    Vehicles in `config.vehicles` are reported from the start, others after their first message. Raises
+    ConfigurationError for an invalid table, BusError without a connection within `timeout_s`.
     """
 
     def __init__(self, config: FleetConfig, timeout_s: float = 10.0) -> None:
         self._slots: dict[str, VehicleSlot] = {check_name("vehicle", name): VehicleSlot() for name in config.vehicles}
-        self._unread: deque[str] = deque()  # vehicles in the order in which their unread news began
+        self._unread: deque[str] = deque()  # vehicles with unread estimates, oldest first
         self._changed = threading.Condition()
         self._closed = False
-        self.refused = 0  # messages under keys that no vehicle has, or of more vehicles than are kept
+        self.refused = 0  # messages with invalid keys, or of too many vehicles
         self._session = open_link(config, timeout_s)
         declare = self._session.declare_subscriber
         self._subscribers: list[Any] = [
@@ -65,15 +65,15 @@ class Fleet(Closing):
             ),
         ]
 
-    # --- what zenoh calls, on its own threads ---
+    # --- callbacks on zenoh's threads ---
 
     def _slot_of(self, key: str) -> tuple[str, str, VehicleSlot] | None:
-        """(vehicle, topic, slot) of a key, with the lock held; None where nothing is kept of it."""
+        """Returns (vehicle, topic, slot) of a key, with the lock held; None for an ignored key."""
         named = vehicle_and_topic(key)
         if named is None or (named[0] not in self._slots and len(self._slots) >= MAX_VEHICLES):
             self.refused += 1
             if self.refused == 1:
-                log.warning("%.100s: nothing is kept of this, and of what is like it", key)
+                log.warning("%.100s: ignored, as are further such messages", key)
             return None
         return named[0], named[1], self._slots.setdefault(named[0], VehicleSlot())
 
@@ -90,7 +90,7 @@ class Fleet(Closing):
                 self._changed.notify_all()
 
     def _receive_retained(self, reply: zenoh.Reply) -> None:
-        """A vehicle's last estimate of before this client; it counts only where none came since."""
+        """Receives a vehicle's last estimate from before this client, unless a newer one has arrived."""
         if reply.ok is not None:
             named = vehicle_and_topic(str(reply.ok.key_expr))
             with self._changed:
@@ -118,43 +118,43 @@ class Fleet(Closing):
         if asks:
             query_in_background(self._session, key_of(vehicle, "estimate"), self._receive_retained)
 
-    # --- what the user calls ---
+    # --- public methods ---
 
     @property
     def connected(self) -> bool:
-        """Whether the router is reached now. Without it all vehicles are soon not alive."""
+        """Whether the router is connected. Without it all vehicles are soon not alive."""
         return bool(self._session.info.routers_zid())
 
     @property
     def vehicles(self) -> tuple[str, ...]:
-        """Those that were expected or have sent something, by name."""
+        """The vehicles that are expected or have sent a message, by name."""
         with self._changed:
             return tuple(sorted(self._slots))
 
     def alive(self, vehicle: str) -> frozenset[str]:
-        """The nodes of a vehicle that are alive. Raises KeyError for an unknown one."""
+        """Returns the alive nodes of a vehicle. Raises KeyError for an unknown one."""
         with self._changed:
             return frozenset(self._slots[vehicle].alive)
 
     def received(self, vehicle: str) -> Received:
-        """How much has been received of a vehicle so far. Raises KeyError for an unknown one."""
+        """Returns the counts of messages received from a vehicle. Raises KeyError for an unknown one."""
         with self._changed:
             slot = self._slots[vehicle]
             return slot.received
 
     def latest(self, vehicle: str, max_age_ms: float = 500.0) -> FleetReading:
-        """The newest estimate of one vehicle so far, at once. Raises KeyError for an unknown one."""
+        """Returns the newest estimate of one vehicle, without waiting. Raises KeyError for an unknown one."""
         with self._changed:
             return self._slots[vehicle].reading(vehicle, max_age_ms)
 
     def readings(self, max_age_ms: float = 500.0) -> tuple[FleetReading, ...]:
-        """The newest estimate of each vehicle so far, at once, by name; of those that fell silent too."""
+        """Returns the newest estimate of each vehicle by name, without waiting; also of silent vehicles."""
         return tuple(self.latest(vehicle, max_age_ms) for vehicle in self.vehicles)
 
     def wait(self, timeout_s: float | None = None, max_age_ms: float = 500.0) -> FleetReading | None:
-        """The newest estimate of the vehicle whose news has waited longest; None where none came in time.
+        """Returns the newest estimate of the vehicle that has waited longest; None if none arrives in time.
 
-        Raises BusClosed once closed, from another thread too.
+        Raises BusClosed after `close`, also from another thread.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._closed or self._unread, timeout_s)
@@ -168,10 +168,10 @@ class Fleet(Closing):
             return slot.reading(vehicle, max_age_ms)
 
     def estimates(self, max_age_ms: float = 500.0) -> Iterator[FleetReading]:
-        """A reading of each vehicle's estimates as they come, for as long as the client is open.
+        """Yields a reading of each vehicle's estimates on arrival, until the client is closed.
 
-        Never silence: of a vehicle whose newest estimate is older than `max_age_ms`, or that has none, a reading says
-        so once in each `max_age_ms`. Of a vehicle's estimates that come between two readings only the newest is left.
+        For a vehicle without an estimate younger than `max_age_ms` it yields a reading every `max_age_ms`. Of several
+        estimates between two readings only the newest is yielded.
         """
         period_ns = round(max_age_ms * 1e6)
         sweep_ns = time.monotonic_ns() + period_ns
@@ -194,7 +194,7 @@ class Fleet(Closing):
                         yield late
 
     def health(self, vehicle: str, node: str) -> Health | None:
-        """The last health of a vehicle's node; None where none has come, or it was malformed."""
+        """Returns the last health of a vehicle's node; None if there is none, or it was malformed."""
         with self._changed:
             slot = self._slots.get(vehicle)
             data = slot.healths.get(node) if slot else None
@@ -204,26 +204,26 @@ class Fleet(Closing):
             return None
 
     def map(self, vehicle: str, timeout_s: float = REPLY_S) -> MapSnapshot | None:
-        """A vehicle's whole map of its newest epoch; None where no reply comes.
+        """Returns a vehicle's whole map of its newest epoch; None without a reply.
 
-        Raises BusError with the reason where it is refused, or where a part of it was lost.
+        Raises BusError with the reason if the query is refused or a part is lost.
         """
         parts = whole_reply(self._session, vehicle, "map", timeout_s, {})
         return whole_map(parts) if parts else None
 
     def trajectory(self, vehicle: str, last_s: float | None = None, timeout_s: float = REPLY_S) -> Trajectory | None:
-        """Where a vehicle and all that it saw have been, in its newest epoch or its last `last_s`; else as `map`."""
+        """Returns the trajectories of a vehicle and its tracks, of its newest epoch or last `last_s`; else as `map`."""
         parameters = {} if last_s is None else {"last_s": last_s}
         parts = whole_reply(self._session, vehicle, "trajectory", timeout_s, parameters)
         return whole_trajectory(parts) if parts else None
 
     def configuration(self, vehicle: str, timeout_s: float = REPLY_S) -> dict[str, Any] | None:
-        """A vehicle's configuration as plain data, as in summary.json; else as `map`."""
+        """Returns a vehicle's configuration as plain data, as in summary.json; else as `map`."""
         parts = whole_reply(self._session, vehicle, "configuration", timeout_s, {})
         return parts[0] if parts else None
 
     def close(self) -> None:
-        """Leaves the router, and wakes who waits; a second call does nothing."""
+        """Closes the connection; waiting calls raise BusClosed. A second call does nothing."""
         with self._changed:
             if self._closed:
                 return

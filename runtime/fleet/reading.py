@@ -1,4 +1,4 @@
-"""What a listener knows of one vehicle: its newest estimate, decoded when it is read, and how many were lost."""
+"""The listener's state of one vehicle: its newest estimate, decoded on reading, and the number of lost ones."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from birdslam.runtime.transport.endpoints import attached
 from birdslam.runtime.wire import Trace, WireError, decode
 from birdslam.types import INVALIDATING, Estimate
 
-CLOCKS_APART_MS = 50.0  # an estimate that is younger than now by more is not on time: one of the two clocks is wrong
+MAX_CLOCK_OFFSET_MS = 50.0  # an estimate from further in the future is not on time: a clock is wrong
 _NO_TRACE = Trace()
 
 log = logging.getLogger(__name__)
@@ -20,12 +20,12 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class FleetReading:
-    """The newest estimate of one vehicle, and three different things to know about it.
+    """The newest estimate of one vehicle with three separate states.
 
-    `alive`: its optimizer runs, and is reached. `on_time`: the estimate is young enough. `valid`: it says that it may
-    be driven by. `age_ms` is the time since the camera took the frame (Estimate.t_utc_ns): keep the clocks of both
-    computers synchronised (PTP, NTP). `silent_ms` needs only this computer's: the time since its last message came.
-    Both are infinite where there is none.
+    `alive`: its optimizer runs and is connected. `on_time`: the estimate is not older than allowed. `valid`: the
+    estimate is valid. `age_ms`: time since the capture of the frame (Estimate.t_utc_ns), which needs synchronized
+    clocks (PTP, NTP). `silent_ms`: time since its last message, by this computer's clock. Both are infinite without a
+    message.
     """
 
     vehicle: str
@@ -35,8 +35,8 @@ class FleetReading:
     valid: bool
     age_ms: float
     silent_ms: float
-    lost: int = 0  # of its estimates, on the way here, since this client listens: its sender numbers them
-    trace: Trace = _NO_TRACE  # where its time went; the stamps are of the vehicle's own clock
+    lost: int = 0  # estimates lost since the start of this client, by their numbers
+    trace: Trace = _NO_TRACE  # stages of the estimate, by the vehicle's clock
 
     @property
     def usable(self) -> bool:
@@ -46,7 +46,7 @@ class FleetReading:
 
 @dataclass(frozen=True)
 class Received:
-    """How much has been received of one vehicle since this client listens."""
+    """Counts of messages received from one vehicle."""
 
     estimates: int
     received_bytes: int  # payloads and attachments of all its messages
@@ -56,7 +56,7 @@ class Received:
 
 @dataclass
 class VehicleSlot:
-    """One vehicle. `fresh`: its newest estimate has not been read; `waiting`: those bytes have not been decoded."""
+    """One vehicle. `fresh`: its newest estimate is unread; `waiting`: its encoded bytes."""
 
     alive: set[str] = field(default_factory=set)
     fresh: bool = False
@@ -68,7 +68,7 @@ class VehicleSlot:
     received_bytes: int = 0
     lost: int = 0
     malformed: int = 0
-    t_reported_ns: int = 0  # when a reading of it was last given by `estimates`
+    t_reported_ns: int = 0  # when `estimates` last yielded a reading of it
     healths: dict[str, bytes] = field(default_factory=dict)
 
     @property
@@ -77,7 +77,7 @@ class VehicleSlot:
         return Received(self.estimates, self.received_bytes, self.lost, self.malformed)
 
     def receive(self, vehicle: str, sample: zenoh.Sample, t_received_ns: int) -> bool:
-        """Takes an estimate in, undecoded, in place of the one before; False where it is malformed."""
+        """Stores an encoded estimate in place of the previous one; returns False if it is malformed."""
         payload = self._payload(sample)
         try:
             trace = attached(sample, Trace) or _NO_TRACE
@@ -93,7 +93,7 @@ class VehicleSlot:
         return True
 
     def receive_health(self, node: str, sample: zenoh.Sample) -> None:
-        """The same of a node's health."""
+        """Stores a node's health."""
         self.healths[node] = self._payload(sample)
 
     def _payload(self, sample: zenoh.Sample) -> bytes:
@@ -104,10 +104,10 @@ class VehicleSlot:
     def _count_malformed(self, vehicle: str, error: WireError) -> None:
         self.malformed += 1
         if self.malformed == 1:
-            log.warning("vehicle %s: a malformed message is ignored, and all that follow: %s", vehicle, error)
+            log.warning("vehicle %s: ignored a malformed message; later ones are only counted: %s", vehicle, error)
 
     def reading(self, vehicle: str, max_age_ms: float) -> FleetReading:
-        """Of now. An estimate that turns out malformed counts as such, and the one before it stays."""
+        """Returns the current reading. A malformed estimate is counted, and the previous one is kept."""
         if self.waiting is not None:
             try:
                 self.estimate = decode(self.waiting, Estimate)
@@ -119,6 +119,6 @@ class VehicleSlot:
         if estimate is None:
             return FleetReading(vehicle, None, alive, False, False, float("inf"), silent_ms, self.lost)
         age_ms = (time.time_ns() - estimate.t_utc_ns) / 1e6
-        on_time = -CLOCKS_APART_MS <= age_ms <= max_age_ms
+        on_time = -MAX_CLOCK_OFFSET_MS <= age_ms <= max_age_ms
         valid = estimate.valid and INVALIDATING.isdisjoint(estimate.status)
         return FleetReading(vehicle, estimate, alive, on_time, valid, age_ms, silent_ms, self.lost, self.trace)

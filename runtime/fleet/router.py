@@ -1,8 +1,8 @@
-"""The router of a fleet: `birdslam router CONFIG.toml`, with the table [router]: who may do what.
+"""The router of a fleet: `birdslam router CONFIG.toml`, with the permissions of the table [router].
 
-A zenoh session in router mode. A vehicle's certificate, by its common name "vehicle NAME", may write the keys of NAME
-and answer queries of them, and read nothing; a listener's may read and query all, and write nothing; everything else
-is denied. A vehicle that floods is thinned as it comes in, before it meets anybody else's messages.
+A zenoh session in router mode. A vehicle's certificate, with the common name "vehicle NAME", may write the keys of NAME
+and answer queries of them; a listener's may read and query all; everything else is denied. Messages of a vehicle over
+the rate limit are dropped on arrival.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from birdslam.runtime.process import signals
 from birdslam.runtime.process.notify import serve
 from birdslam.runtime.topology import QUERIES, VERSION, every_key
 
-_ACCEPT_MS = 2_000  # who connects and then says nothing is let go
+_ACCEPT_MS = 2_000  # timeout of the handshake
 PUBLISHED = ("estimate", "health/*")  # by a vehicle; no images, no measurements
-QUERYABLE = (*PUBLISHED, *QUERIES)  # a vehicle answers queries of these
+QUERYABLE = (*PUBLISHED, *QUERIES)  # answered by a vehicle
 ALIVE = "alive/*"
 
 
 def router_config(config: RouterConfig) -> zenoh.Config:
-    """Of the router's session. Raises ConfigurationError, which names the key."""
+    """Returns the configuration of the router's session. Raises ConfigurationError with the key."""
     check("router", config, "listen")
     if not config.vehicles:
-        raise ConfigurationError("router.vehicles: name those that may publish here")
+        raise ConfigurationError("router.vehicles: is empty; name the vehicles that may publish")
     settings = settings_of("router") | {
         "listen/endpoints": [config.listen],
         "transport/unicast/accept_timeout": _ACCEPT_MS,
@@ -52,7 +52,7 @@ def router_config(config: RouterConfig) -> zenoh.Config:
 
 
 def access_control(vehicles: tuple[str, ...], listeners: tuple[str, ...]) -> dict[str, Any]:
-    """zenoh's access control; the default is to deny."""
+    """Returns zenoh's access control; the default is to deny."""
     rules = [
         _rule("vehicles are queried", "egress", ["declare_subscriber", "query"], map(every_key, QUERYABLE)),
         _rule(
@@ -104,7 +104,7 @@ def run(config: RouterConfig) -> None:
     """Routes until SIGTERM or SIGINT. Raises ConfigurationError."""
     settings = router_config(config)
     signals.block()
-    # Who was refused, and why, on standard error; RUST_LOG says otherwise
+    # Log refused connections and their reasons; RUST_LOG overrides it
     zenoh.init_log_from_env_or("error,zenoh_link_tls=warn,zenoh::net::routing::interceptor::access_control=info")
     try:
         session = zenoh.open(settings)

@@ -1,9 +1,8 @@
-"""A vehicle's way to the router of its fleet: `birdslam uplink CONFIG.toml`, with the table [fleet].
+"""The uplink of a vehicle to the router of its fleet: `birdslam uplink CONFIG.toml`, with the table [fleet].
 
-A process of its own, and of its vehicle's bus a planner like any other: it can slow nothing down, and only queries come
-in through it. It forwards estimates (`fleet.estimates_hz` of them at most), the nodes' healths, which
-nodes are alive; and it answers what a planner may query. Images and measurements stay in the vehicle. Everything is
-sent with congestion control DROP: a slow network loses messages, which the listener counts.
+A separate process and a planner of its vehicle's bus, so that it slows nothing down. It forwards estimates (at most
+`fleet.estimates_hz`), healths and liveliness, and answers queries. Images and measurements stay in the vehicle. A slow
+network drops messages, which the listener counts.
 """
 
 from __future__ import annotations
@@ -33,12 +32,12 @@ from birdslam.runtime.wire import Stage, Trace, WireError
 
 FORWARDED = ("estimate", *(f"health/{node}" for node in PROCESSES))
 _NODE = "uplink"
-_MAX_STAGES = 7  # of a trace that comes in, so that one more fits
-_TRY_S = 2.0  # one attempt to reach the router
+_MAX_STAGES = 7  # of a received trace, so that one more fits
+_TRY_S = 2.0  # timeout of one attempt to connect
 
 
 class Uplink(Closing):
-    """Forwards to the router what a vehicle publishes on its bus, until it is closed, and the session with it.
+    """Forwards messages from a vehicle's bus to the router until it is closed; closes the session too.
 
     A context manager. Raises as Bus does.
     """
@@ -70,7 +69,7 @@ class Uplink(Closing):
 
     @property
     def connected(self) -> bool:
-        """Whether the router is there now."""
+        """Whether the router is connected."""
         return bool(self._session.info.routers_zid())
 
     @property
@@ -79,7 +78,7 @@ class Uplink(Closing):
         return self._bus.alive & set(PROCESSES)
 
     def _alive_changed(self, node: str, alive: bool) -> None:
-        if node not in PROCESSES:  # others than the vehicle's nodes are nobody's business
+        if node not in PROCESSES:  # only the vehicle's nodes
             return
         self._changes.put((node, alive))
         if alive:
@@ -88,7 +87,7 @@ class Uplink(Closing):
                     self._bus.catch_up(topic, self._subscribers[topic])
 
     def _forward_liveliness(self) -> None:
-        """On a thread of its own: zenoh's own is never kept waiting for the network."""
+        """Runs on a thread, so that zenoh's thread does not wait for the network."""
         while (change := self._changes.get()) is not None:
             node, alive = change
             if alive and node not in self._tokens:
@@ -108,28 +107,28 @@ class Uplink(Closing):
                 now_ns = time.monotonic_ns()
                 if not due.passes(now_ns):
                     continue
-                publisher.put(message.record, _lengthened(message.trace, message.t_received_ns, now_ns))
+                publisher.put(message.record, _with_uplink(message.trace, message.t_received_ns, now_ns))
             except BusClosed:
                 return
-            except (BusError, WireError) as error:  # this message alone
+            except (BusError, WireError) as error:  # only this message is lost
                 print(f"birdslam: uplink: {topic}: {error}", file=sys.stderr, flush=True)
 
     def _handler(self, name: str) -> Any:
-        def ask(parameters: Mapping[str, str]) -> Sequence[msgspec.Struct]:
+        def forward(parameters: Mapping[str, str]) -> Sequence[msgspec.Struct]:
             given = {key: value for key in QUERIES[name].parameters if (value := positive(parameters, key)) is not None}
             try:
                 return self._bus.query(name, **given)
             except BusError as error:
                 raise QueryRefused(str(error)) from error
 
-        return ask
+        return forward
 
     def step(self) -> None:
-        """Its threads send."""
+        """Does nothing: threads send."""
 
     def close(self) -> None:
-        """Forwards nothing more; the vehicle's nodes are then not alive for the fleet."""
-        self._bus.close()  # wakes those that forward
+        """Stops forwarding; the fleet then sees the vehicle's nodes as not alive."""
+        self._bus.close()  # wakes the forwarding threads
         self._changes.put(None)
         for thread in self._threads:
             thread.join()
@@ -137,17 +136,17 @@ class Uplink(Closing):
         close_session(self._session)
 
 
-def _lengthened(trace: Trace, received_ns: int, done_ns: int) -> Trace:
-    """With the uplink's own stage; what was left of the budget stays in it."""
+def _with_uplink(trace: Trace, received_ns: int, done_ns: int) -> Trace:
+    """Adds the uplink's stage to the trace."""
     stages = (*trace.stages[:_MAX_STAGES], Stage(_NODE, received_ns, done_ns))
     return msgspec.structs.replace(trace, stages=stages)
 
 
 def run(configuration: Configuration) -> None:
-    """Until SIGTERM or SIGINT; waits for the router, for ever. Raises ConfigurationError, and as Bus does."""
+    """Runs until SIGTERM or SIGINT; waits for the router without limit. Raises ConfigurationError, and as Bus does."""
     vehicle, config = configuration.vehicle, configuration.fleet
     if not config.router:
-        raise ConfigurationError("fleet.router: names no router to publish at")
+        raise ConfigurationError("fleet.router: is empty; name the router to publish to")
     check("fleet", config, "router")
     signals.block()
     zenoh.init_log_from_env_or("error")

@@ -1,4 +1,4 @@
-"""Files from the network: with a limit on their size, with progress, and whole or not at all."""
+"""Downloads files with a size limit and progress, completely or not at all."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from urllib.parse import urlsplit
 CHUNK_BYTES = 1 << 16
 SCHEMES = ("https", "http")
 
-Progress = Callable[[int, int | None], None]  # bytes so far, bytes in all where the server says
+Progress = Callable[[int, int | None], None]  # bytes received, total bytes if known
 
 
 class DownloadError(ValueError):
-    """A file that could not be had; the message names its address and the reason."""
+    """A download failed; the message names the address and the reason."""
 
 
 def download(address: str, target: Path, limit_bytes: int, timeout_s: float, progress: Progress) -> None:
-    """Writes the file at an http(s) address to `target`; `timeout_s` is for the connection and each wait for data.
+    """Writes the file at an http(s) address to `target`; `timeout_s` applies to the connection and each wait for data.
 
-    Raises DownloadError, with `target` gone, where it is over the limit, shorter than announced, or out of reach.
+    On failure it removes `target` and raises DownloadError: file over the limit, incomplete, or unreachable.
     """
     if urlsplit(address).scheme not in SCHEMES:
-        raise DownloadError(f"{address}: no address that begins with {' or '.join(f'{s}://' for s in SCHEMES)}")
+        raise DownloadError(f"{address}: unknown scheme; use {' or '.join(f'{s}://' for s in SCHEMES)}")
     try:
         _fetch(address, target, limit_bytes, timeout_s, progress)
     except DownloadError:
@@ -34,7 +34,7 @@ def download(address: str, target: Path, limit_bytes: int, timeout_s: float, pro
         raise
     except urllib.error.HTTPError as error:
         target.unlink(missing_ok=True)
-        raise DownloadError(f"{address}: the server says {error.code} {error.reason}") from error
+        raise DownloadError(f"{address}: the server returned {error.code} {error.reason}") from error
     except (urllib.error.URLError, http.client.HTTPException, OSError, ValueError) as error:
         target.unlink(missing_ok=True)
         raise DownloadError(f"{address}: {getattr(error, 'reason', None) or error}") from error
@@ -56,13 +56,13 @@ def _fetch(address: str, target: Path, limit_bytes: int, timeout_s: float, progr
             file.write(chunk)
             progress(got_bytes, total_bytes)
         if total_bytes is not None and got_bytes < total_bytes:
-            raise DownloadError(f"{address}: broke off after {got_bytes} of {total_bytes} bytes")
+            raise DownloadError(f"{address}: interrupted after {got_bytes} of {total_bytes} bytes")
 
 
 class _Redirects(urllib.request.HTTPRedirectHandler):
-    """Follows a server to another web address, and to nothing else."""
+    """Follows redirects to http(s) addresses only."""
 
     def redirect_request(self, request: Any, file: Any, code: Any, message: Any, headers: Any, address: str) -> Any:
         if urlsplit(address).scheme not in SCHEMES:
-            raise DownloadError(f"{request.full_url}: leads to {address}, which is no {' or '.join(SCHEMES)} address")
+            raise DownloadError(f"{request.full_url}: redirects to {address}, not an {' or '.join(SCHEMES)} address")
         return super().redirect_request(request, file, code, message, headers, address)

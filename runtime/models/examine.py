@@ -1,4 +1,4 @@
-"""Whether a network fits its manifest: it is opened as a run would, and run once on made input."""
+"""Checks whether a network matches its manifest: loads it as a run does, and runs it once on synthetic input."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TEST_BOXES = 8
 
 
 def examine(network: Path, manifest: str) -> list[str]:
-    """Opens a network as a run would and runs it once on made input: a few lines on it. Raises ModelError."""
+    """Loads a network and runs it once on synthetic input; returns a report of a few lines. Raises ModelError."""
     role = read_header(network, manifest).role
     return _examine_frusta(network, manifest) if role == "pointnet" else _examine_images(network, manifest)
 
@@ -30,7 +30,7 @@ def _examine_images(network: Path, manifest: str) -> list[str]:
     found = model.run(image)
     took_ms = (time.perf_counter_ns() - begun_ns) / 1e6
     if found is None:
-        raise ModelError(f"{network}: its outputs hold numbers that are not finite on a noise image")
+        raise ModelError(f"{network}: its outputs are not finite on a noise image")
     takes = model.manifest.input
     given = f"{takes.name} {takes.width_px}x{takes.height_px}, {takes.layout}, {takes.colour}"
     return _fits(network, model, given, f"{took_ms:.1f} ms on a {TEST_IMAGE_PX[1]}x{TEST_IMAGE_PX[0]} image")
@@ -45,9 +45,9 @@ def _examine_frusta(network: Path, manifest: str) -> list[str]:
     found = model.locate(boxes, ["car"] * TEST_BOXES, camera)
     took_ms = (time.perf_counter_ns() - begun_ns) / 1e6
     if found is None:
-        raise ModelError(f"{network}: its outputs hold numbers that are not finite on a cloud of points")
+        raise ModelError(f"{network}: its outputs are not finite on a point cloud")
     takes = model.manifest.points
-    given = f"{takes.name}, {takes.count} points a box, {takes.layout}: {' '.join(takes.features)}"
+    given = f"{takes.name}, {takes.count} points per box, {takes.layout}: {' '.join(takes.features)}"
     return _fits(network, model, given, f"{took_ms:.1f} ms on {TEST_BOXES} boxes of points")
 
 
@@ -64,7 +64,7 @@ def _fits(network: Path, model: Network | PointNet, given: str, test_run: str) -
 
 
 def read_header(network: Path, manifest: str = "") -> ManifestHeader:
-    """Role and title by the manifest; the network is not opened. Raises ModelError."""
+    """Reads role and title from the manifest, without loading the network. Raises ModelError."""
     try:
         content = network.read_bytes()
     except OSError as error:

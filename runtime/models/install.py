@@ -1,8 +1,7 @@
-"""Installing networks by name: from the catalogue, a file or an address.
+"""Installs networks from the catalogue, a file or an address.
 
-An installed network is whole and fits, or nothing of it is there: it is fetched, checked and run in a scratch
-directory, which becomes the model's own by one renaming. Nothing of a model is ever executed but its graph, by
-onnxruntime.
+A network is fetched, checked and run in a scratch directory, which is then renamed into place. Only the network's graph
+is executed, by onnxruntime.
 """
 
 from __future__ import annotations
@@ -34,30 +33,30 @@ _SCRATCH = ".adding-"
 
 @dataclass(frozen=True)
 class Installation:
-    """One network to be installed: its name, where it is had from, and what it must be."""
+    """One network to install: its name, source, and expected hash."""
 
     name: str
     source: str  # a path, or an http(s) address
-    manifest: str  # a path, an address, the name of a shipped one; "": found as for any network
-    sha256: str  # "": what the manifest pins, or for a file of this machine what it has
+    manifest: str  # a path, an address, or the name of a shipped one; "": found as for any network
+    sha256: str  # "": that of the manifest; a local file needs none
     limit_bytes: int
 
     @property
     def remote(self) -> bool:
-        """Whether it comes over the network."""
+        """Whether the source is an address."""
         return _is_address(self.source)
 
 
 def installation_of(source: str, name: str, manifest: str, sha256: str, limit_bytes: int) -> Installation:
-    """What one argument of `models add` asks for. Raises ModelError."""
+    """Parses one argument of `models add`. Raises ModelError."""
     if sha256 and not re.fullmatch("[0-9a-f]{64}", sha256.lower()):
-        raise ModelError(f"--sha256 {sha256}: 64 hexadecimal digits are needed")
+        raise ModelError(f"--sha256 {sha256}: expected 64 hexadecimal digits")
     if name and not model_store.is_name(name):
-        raise ModelError(f"--name {name}: letters, digits, _ . - are needed, no .onnx at its end")
+        raise ModelError(f"--name {name}: expected letters, digits, _ . -, without .onnx at the end")
     if model_store.is_name(source) and not Path(source).is_file():
         known = catalogue()
         if source not in known.models:
-            raise ModelError(f"no model {source!r} in the catalogue, which has {', '.join(known.models)}; no such file")
+            raise ModelError(f"{source!r} is neither a file nor in the catalogue, which has {', '.join(known.models)}")
         entry = known.models[source]
         if sha256 and sha256.lower() != entry.sha256:
             raise ModelError(f"{source}: --sha256 {sha256} is not the catalogue's {entry.sha256}")
@@ -66,34 +65,34 @@ def installation_of(source: str, name: str, manifest: str, sha256: str, limit_by
         return Installation(name or source, address, manifest, entry.sha256, size_bytes)
     if source.endswith((".xml", ".bin")):
         raise ModelError(
-            f"{source}: an OpenVINO IR is not read; convert it to ONNX with OpenVINO's tools, name that file"
+            f"{source}: OpenVINO IR is not supported; convert it to ONNX with OpenVINO's tools and name that file"
         )
     stem = Path(urlsplit(source).path if _is_address(source) else source).stem
     if not name and not model_store.is_name(stem):
-        raise ModelError(f"{source}: {stem!r} is no name for a model: state one by --name")
+        raise ModelError(f"{source}: {stem!r} is not a valid model name; set one with --name")
     return Installation(name or stem, source, manifest, sha256.lower(), limit_bytes)
 
 
 def install(wanted: Installation, directory: Path) -> list[str]:
-    """Fetches, checks and installs one network; gives what `examine` says of it.
+    """Fetches, checks and installs one network; returns the report of `examine`.
 
-    Raises ModelError or DownloadError, and then leaves nothing behind.
+    Raises ModelError or DownloadError; nothing is then installed.
     """
     with _scratch(directory) as scratch:
         made = scratch / wanted.name
         made.mkdir()
         network = made / f"{wanted.name}.onnx"
         _fetch(wanted.source, network, wanted.limit_bytes)
-        has = hashlib.sha256(network.read_bytes()).hexdigest()
-        if wanted.sha256 and has != wanted.sha256:
-            raise ModelError(f"{wanted.source}: SHA-256 {has}, but {wanted.sha256} was expected: refused")
-        text, pinned = _manifest_text(wanted, network, has, scratch)
-        if wanted.remote and not wanted.sha256 and pinned != has:
-            raise ModelError(f"{wanted.source}: no SHA-256 is known for it: state it by --sha256 or in its manifest")
+        actual = hashlib.sha256(network.read_bytes()).hexdigest()
+        if wanted.sha256 and actual != wanted.sha256:
+            raise ModelError(f"{wanted.source}: SHA-256 {actual}, but {wanted.sha256} was expected: refused")
+        text, pinned = _manifest_text(wanted, network, actual, scratch)
+        if wanted.remote and not wanted.sha256 and pinned != actual:
+            raise ModelError(f"{wanted.source}: its SHA-256 is unknown; set it with --sha256 or in its manifest")
         network.with_suffix(".toml").write_text(text)
         try:
             lines = examine(network, "")
-        except ModelError as error:  # named by where it came from, not by a place that is about to vanish
+        except ModelError as error:  # name the source, not the scratch directory
             raise ModelError(f"refused: {str(error).replace(str(network), wanted.source)}") from error
         target = directory / wanted.name
         if target.exists():
@@ -103,7 +102,7 @@ def install(wanted: Installation, directory: Path) -> list[str]:
 
 
 def _manifest_text(wanted: Installation, network: Path, sha256: str, scratch: Path) -> tuple[str, str]:
-    """The manifest to install, pinned to the network, and the SHA-256 that it was pinned to before ("": to none)."""
+    """Returns the manifest pinned to the network, and the SHA-256 that it was pinned to before ("": none)."""
     explicit = wanted.manifest
     beside = f"{wanted.source.removesuffix('.onnx')}.toml"
     by_hash = not explicit and any(sha256 in path.read_text() for path in shipped_manifests().values())
@@ -151,7 +150,7 @@ def _is_address(text: str) -> bool:
 
 @contextlib.contextmanager
 def _scratch(directory: Path) -> Iterator[Path]:
-    """A directory beside the models that is gone afterwards, with what a killed `add` has left; one `add` at a time."""
+    """Creates a temporary directory beside the models, under a lock; removes those of killed commands."""
     try:
         directory.mkdir(parents=True, exist_ok=True)
         with (directory / ".lock").open("w") as lock:
@@ -161,4 +160,4 @@ def _scratch(directory: Path) -> Iterator[Path]:
             with tempfile.TemporaryDirectory(prefix=_SCRATCH, dir=directory) as scratch:
                 yield Path(scratch)
     except OSError as error:
-        raise ModelError(f"{directory}: nothing can be installed there: {error.strerror}") from error
+        raise ModelError(f"{directory}: can't install there: {error.strerror}") from error

@@ -1,7 +1,7 @@
-"""What computes a network on this computer: the CPU, or what else is there, wins a second of measurement and agrees.
+"""Selects the onnxruntime provider of a network: the fastest one whose results agree with the CPU's.
 
-Which there is depends on the package of onnxruntime: onnxruntime-openvino and onnxruntime-gpu bring more. One that is
-asked for by name and is not there gives way to the CPU, and each frame says so (`provider_missing`).
+onnxruntime-openvino and onnxruntime-gpu have more providers than the CPU. A configured provider that is missing is
+replaced by the CPU, with the status `provider_missing`.
 """
 
 from __future__ import annotations
@@ -17,19 +17,17 @@ import numpy as np
 
 from birdslam.perception import ModelSpec, Network, load_network
 
-MEASURED_S = 1.0  # of all providers together
+MEASURED_S = 1.0  # for all providers together
 MIN_RUNS = 3
-# Of each output the RMS difference to the CPU's, by its RMS. A network that is off by more is computed otherwise than
-# it was tested: OpenVINO rounds our network's 8 bits so that it is off by 7.5 %, and two in floats by less than .01 %
-TOLERANCE_REL = 0.02
-WINS_BY = 0.95  # of the CPU's time: less of a gain is noise
+TOLERANCE_REL = 0.02  # RMS difference of an output to the CPU's, relative to its RMS
+MAX_TIME_RATIO = 0.95  # to the CPU's time: a smaller gain is noise
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Measured:
-    """Of one provider: the median of a run, how far off it is by RMS, and why it does not run, if so."""
+    """One provider's median run time, its RMS difference to the CPU, and why it does not run, if so."""
 
     ms: float
     off_rel: float
@@ -37,7 +35,7 @@ class Measured:
 
     @property
     def agrees(self) -> bool:
-        """Whether it runs and gives what the CPU gives."""
+        """Whether it runs and agrees with the CPU."""
         return not self.problem and self.off_rel <= TOLERANCE_REL
 
 
@@ -48,7 +46,7 @@ def compared(
     within_s: float = MEASURED_S,
     most_threads: int | None = None,
 ) -> dict[str, Measured]:
-    """Provider -> its figures, on an image of noise of the network's size; "cpu" is the measure of the others."""
+    """Measures the providers on a noise image of the network's size; "cpu" is the reference."""
     out: dict[str, Measured] = {}
     truth: dict[str, np.ndarray] = {}
     for provider in ("cpu", *(each for each in providers if each != "cpu")):
@@ -66,7 +64,7 @@ def compared(
 
 
 def chosen(role: str, spec: ModelSpec, asked: str, here: Collection[str], most_threads: int | None = None) -> ModelSpec:
-    """The network with the provider that computes it; `asked` is perceive.provider: the network's own goes before."""
+    """Returns the network with the selected provider; its own overrides `asked`, which is perceive.provider."""
     asked = spec.provider or asked
     if asked != "auto":
         return msgspec.structs.replace(spec, provider=asked)
@@ -74,15 +72,15 @@ def chosen(role: str, spec: ModelSpec, asked: str, here: Collection[str], most_t
         return msgspec.structs.replace(spec, provider="cpu")
     figures = compared(role, spec, here, most_threads=most_threads)
     best = min((name for name, found in figures.items() if found.agrees), key=lambda name: figures[name].ms)
-    if figures[best].ms > WINS_BY * figures["cpu"].ms:
+    if figures[best].ms > MAX_TIME_RATIO * figures["cpu"].ms:
         best = "cpu"
-    said = ", ".join(
+    summary = ", ".join(
         f"{name} {found.ms:.1f} ms"
         if found.agrees
-        else f"{name} not ({found.problem or f'off by {found.off_rel:.1%}'})"
+        else f"{name} rejected ({found.problem or f'differs by {found.off_rel:.1%}'})"
         for name, found in figures.items()
     )
-    log.info("%s: computed by %s (%s)", role, best, said)
+    log.info("%s: runs on %s (%s)", role, best, summary)
     return msgspec.structs.replace(spec, provider=best)
 
 
@@ -94,7 +92,7 @@ def _off(found: np.ndarray, truth: np.ndarray) -> float:
 def _median_ms(network: Network, within_s: float) -> float:
     until_s, took_ms = time.monotonic() + within_s, list[float]()
     while len(took_ms) < MIN_RUNS or time.monotonic() < until_s:
-        begun_s = time.perf_counter()
+        start_s = time.perf_counter()
         network.infer()
-        took_ms.append((time.perf_counter() - begun_s) * 1e3)
+        took_ms.append((time.perf_counter() - start_s) * 1e3)
     return statistics.median(took_ms)

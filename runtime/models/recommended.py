@@ -1,4 +1,4 @@
-"""The networks that a film of a real road wants, beside the shipped one, which has seen rendered streets alone."""
+"""Recommended networks for real roads; the shipped one was trained on rendered streets only."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ RECOMMENDED = ("yolox_nano", "twinlitenet")  # a detector and a segmenter, of th
 
 @dataclass(frozen=True)
 class Recommended:
-    """Those that are installed, by name, and those that are not, as the catalogue has them."""
+    """Names of the installed recommended networks, and catalogue entries of the missing ones."""
 
     at_hand: tuple[str, ...]
     missing: dict[str, Entry]
 
     @property
     def question(self) -> str:
-        """What somebody is asked who may have the missing ones."""
+        """The question whether to download the missing ones."""
         each = ", ".join(f"{name} ({entry.licence})" for name, entry in self.missing.items())
         megabytes = sum(entry.size_bytes for entry in self.missing.values()) / 1e6
         return (
-            "The network that ships has seen rendered streets alone, and finds four to eight of ten real cars. "
-            f"Fetch {each}, {megabytes:.1f} MB, from their authors, once?"
+            "The shipped network was trained on rendered streets only and detects 40 to 80 % of real cars. "
+            f"Download {each}, {megabytes:.1f} MB, from their authors?"
         )
 
 
 def recommended(directory: Path) -> Recommended:
-    """What of the recommended networks lies in the models directory."""
+    """Returns which recommended networks are installed in the models directory."""
     at_hand, known = store.installed(directory), catalogue().models
     return Recommended(
         tuple(name for name in RECOMMENDED if name in at_hand),

@@ -1,5 +1,5 @@
-"""ROS 2 live, without ROS: as a node among those of rmw_zenoh, at its router.
+"""Live ROS 2 without a ROS installation: a node at the router of rmw_zenoh.
 
-`session` opens and names the node, `publisher` (`birdslam ros`) says what BirdSLAM says, `camera` takes images and the
-car's own speed from topics (`--source ros:/TOPIC`).
+`session` opens the node, `publisher` (`birdslam ros`) publishes estimates, `camera` receives images and the car's own
+speed from topics (`--source ros:/TOPIC`).
 """

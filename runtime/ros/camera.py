@@ -1,7 +1,7 @@
-"""`ros:/TOPIC`: images of a topic of ROS 2, live, with the car's own speed and satellite fixes from other topics.
+"""The source `ros:/TOPIC`: live images of a ROS 2 topic, with the car's own speed and GNSS fixes from other topics.
 
-The camera is that of the CameraInfo beside the images and of /tf_static, where no camera file is given. Time is that of
-the messages' headers, brought to CLOCK_MONOTONIC; while no image comes, frames without one say so.
+Without a camera file the camera comes from CameraInfo and /tf_static. The headers' times are converted to
+CLOCK_MONOTONIC. A missing image gives a frame without one.
 """
 
 from __future__ import annotations
@@ -47,19 +47,18 @@ from birdslam.sources.speed_log import KEPT_NS, KEPT_READINGS
 from birdslam.types import NS_PER_S, SpeedReading
 
 NODE = "birdslam_camera"
-TOPIC = "topic:"  # before the name of one, as results.gnss
-# Of loops/gnss/files.py
-GNSS_HEAD = "time_s,latitude_deg,longitude_deg,sigma_m"
-SAME_CLOCK_NS = NS_PER_S  # a header that is within so much of this computer's UTC is of its clock
-CLOCK_FRAMES = 100  # of another clock: the least delay of so many frames tells how far off it is
-RATE_FRAMES = 10  # the median of so many intervals is the frame rate, before the first frame is given
+TOPIC = "topic:"  # prefix of a topic in results.gnss
+GNSS_HEAD = "time_s,latitude_deg,longitude_deg,sigma_m"  # as in loops/gnss/files.py
+SAME_CLOCK_NS = NS_PER_S  # max. difference of a header to UTC to count as this computer's clock
+CLOCK_FRAMES = 100  # the offset of another clock is the minimum delay of so many frames
+RATE_FRAMES = 10  # the frame rate is the median of so many intervals
 
 
 log = logging.getLogger(__name__)
 
 
 class Arrived(NamedTuple):
-    """A message as it came, not yet read."""
+    """A received message, not yet decoded."""
 
     type_name: str | None
     data: bytes
@@ -67,17 +66,17 @@ class Arrived(NamedTuple):
 
 
 class SenderClock:
-    """The times of headers on CLOCK_MONOTONIC.
+    """Converts the times of headers to CLOCK_MONOTONIC.
 
-    A header of this computer's UTC is brought over exactly. Another clock (another computer, a simulation) is taken to
-    be off by the least delay of the last frames, so that intervals stay its own and no image is from the future.
+    Headers in this computer's UTC are converted exactly. The offset of another clock (another computer, a simulation)
+    is the minimum delay of the last frames, which preserves intervals and gives no image from the future.
     """
 
     def __init__(self) -> None:
         self._delays_ns: deque[int] = deque(maxlen=CLOCK_FRAMES)
 
     def monotonic_ns(self, stamp_ns: int, arrived_ns: int, utc_ns: int) -> int:
-        """`utc_ns` is UTC when it arrived."""
+        """Converts a stamp; `utc_ns` is UTC at its arrival."""
         if abs(utc_ns - stamp_ns) <= SAME_CLOCK_NS:
             self._delays_ns.clear()
             return min(arrived_ns, arrived_ns - (utc_ns - stamp_ns))
@@ -86,10 +85,10 @@ class SenderClock:
 
 
 class RosCamera:
-    """A source (nodes/sources.py) of one topic of images.
+    """A source (nodes/sources.py) of one image topic.
 
-    Raises ConfigurationError for a name that can't be, and SourceError where with `must_open` no image comes within
-    source.camera_timeout_s, or one that the camera is not for.
+    Raises ConfigurationError for an invalid name; with `must_open` SourceError if no image arrives within
+    source.camera_timeout_s, or the image size differs from the camera's.
     """
 
     live = True
@@ -113,7 +112,7 @@ class RosCamera:
         self._transforms: list[Arrived] = []
         self._readings: deque[tuple[int, SpeedReading]] = deque(maxlen=KEPT_READINGS)
         self._problem = ""
-        self._came = self._lost = self._number = 0  # images, those lost on their way here, the newest one's number
+        self._came = self._lost = self._number = 0  # received images, lost images, number of the newest
         self._closed = False
         self._clock = SenderClock()
         self.rate_hz = source.rate if isinstance(source.rate, float) else 0.0
@@ -122,7 +121,7 @@ class RosCamera:
         self._asks_camera = configuration.camera is None
         self._node: RosNode | None = None
         if not must_open:
-            assert configuration.camera is not None  # capture goes on with the camera that the first one found
+            assert configuration.camera is not None  # found at the first start
             self.camera = configuration.camera
             return
         try:
@@ -140,19 +139,19 @@ class RosCamera:
 
     def _listen(self, node: RosNode) -> None:
         domain = node.domain
-        said: set[Publication] = set()
+        known: set[Publication] = set()
 
-        def publisher_came(token: str) -> None:
+        def publisher_found(token: str) -> None:
             found = publication_of(token)
-            if found is None or found in said:
+            if found is None or found in known:
                 return
-            said.add(found)
+            known.add(found)
             kind = found.type_name.replace("/msg/", "/")
             if found.topic == self._topic and kind not in IMAGES:
                 with self._arrived:
                     self._problem = f"{found.topic} is {kind}; expected {' or '.join(IMAGES)}"
                     self._arrived.notify_all()
-            node.say_listening(found.topic, found.type_name, found.type_hash, SENSOR_QOS)
+            node.declare_subscription(found.topic, found.type_name, found.type_hash, SENSOR_QOS)
 
         listens: list[tuple[str, Callable[[zenoh.Sample], object]]] = [(self._topic, self._image_came)]
         if self._asks_camera:
@@ -163,11 +162,11 @@ class RosCamera:
         if self._gnss is not None:
             listens.append((self._fixes, self._fix_came))
         for topic, came in listens:
-            node.watch(publishers_key(domain, topic), publisher_came)
+            node.watch(publishers_key(domain, topic), publisher_found)
             node.subscribe(any_type_key(domain, topic), came)
 
     def _info_topics(self) -> list[str]:
-        """By image_transport's rule it stands beside the images: /camera/image_raw/compressed, /camera/camera_info."""
+        """Returns the CameraInfo topics by image_transport's rule: /camera/camera_info for /camera/image_raw."""
         if self._topics.camera_info:
             return [self._topics.camera_info]
         space, found = self._topic, []
@@ -182,8 +181,7 @@ class RosCamera:
             self._arrived.notify_all()
 
     def _count(self, sample: zenoh.Sample) -> None:
-        """The images, and by their numbers those that their sender or the router has dropped; another sender's begin
-        again."""
+        """Counts images, and by their numbers the lost ones; the numbers of another sender restart."""
         number = None if sample.attachment is None else sequence_of(sample.attachment.to_bytes())
         if number is not None and 0 < self._number < number:
             self._lost += number - self._number - 1
@@ -233,7 +231,7 @@ class RosCamera:
         return clock.monotonic_ns(stamp_ns(message), came.t_ns, time.time_ns() - (time.monotonic_ns() - came.t_ns))
 
     def _open(self, given: Camera | None) -> Camera:
-        """Waits for images, and for the camera where none was given."""
+        """Waits for images, and for the camera if none was given."""
         limit_s = self._config.camera_timeout_s
         until_s = time.monotonic() + limit_s
         with self._arrived:
@@ -259,8 +257,8 @@ class RosCamera:
 
     def _absence(self) -> str:
         if self._node is None or not self._node.connected:
-            return f"ros.router {self._ros.router}: the router is not there"
-        return f"nobody publishes {self._topic} in domain {self._node.domain}"
+            return f"ros.router {self._ros.router}: the router is not connected"
+        return f"{self._topic} has no publisher in domain {self._node.domain}"
 
     def _own_camera(self, frame: str, until_s: float) -> Camera:
         def known() -> Camera | None:
@@ -279,17 +277,17 @@ class RosCamera:
                 self._arrived.wait_for(known, max(0.0, until_s - time.monotonic()))
                 camera, has_info = known(), bool(self._infos)
         except ValueError as error:
-            raise SourceError(f"{self.name}: {error}: a camera file is needed (--camera FILE)") from None
+            raise SourceError(f"{self.name}: {error}; name a camera file with --camera FILE") from None
         if camera is None:
             lacks = (
                 f"no {TF_STATIC} from base_footprint or base_link to {frame}" if has_info else f"no {CAMERA_INFO} of it"
             )
-            raise SourceError(f"{self.name}: {lacks}: a camera file is needed (--camera FILE)")
+            raise SourceError(f"{self.name}: {lacks}; name a camera file with --camera FILE")
         return camera
 
     def _read(self, came: Arrived) -> Any:
         if came.type_name is None:
-            raise ValueError("a message of no type of ROS")
+            raise ValueError("a message without a ROS type")
         return self._types.read(came.data, came.type_name)
 
     def _pixels(self, message: Any, came: Arrived) -> NDArray[np.uint8]:
@@ -299,16 +297,16 @@ class RosCamera:
         return decode_image(bytes(message.data)) if hasattr(message, "format") else pixels(message)
 
     def frames(self) -> Generator[RecordedFrame]:
-        """Images as they come; while none comes, frames without one."""
+        """Yields images on arrival, and frames without an image while none arrives."""
         last_ns = 0
-        patience_s = max(self._config.reopen_ms / 1e3, 5.0 / self.rate_hz if self.rate_hz else 0.0)
+        timeout_s = max(self._config.reopen_ms / 1e3, 5.0 / self.rate_hz if self.rate_hz else 0.0)
         try:
             for index in islice(count(), self._config.frames):
                 if self._node is None:
                     with suppress(NoRouter):
                         self._connect(ROUTER_S)
                 with self._arrived:
-                    self._arrived.wait_for(lambda: self._closed or self._images, patience_s)
+                    self._arrived.wait_for(lambda: self._closed or self._images, timeout_s)
                     if self._closed:
                         return
                     came = self._images.popleft() if self._images else None
@@ -316,7 +314,7 @@ class RosCamera:
                     now_ns = max(time.monotonic_ns(), last_ns + 1)
                     last_ns = now_ns
                     reason = self._problem or self._absence()
-                    yield RecordedFrame(index, now_ns, None, f"{self.name}: no image for {patience_s:g} s: {reason}")
+                    yield RecordedFrame(index, now_ns, None, f"{self.name}: no image for {timeout_s:g} s: {reason}")
                     continue
                 frame = self._frame(index, came, last_ns)
                 last_ns = frame.t_source_ns
@@ -329,7 +327,7 @@ class RosCamera:
             message = self._read(came)
             t_ns = self._time_ns(message, came, self._clock)
             if t_ns <= last_ns:
-                raise ValueError("its time is not later than that of the one before")
+                raise ValueError("its time is not later than the previous one")
             image = self._pixels(message, came)
         except ValueError as error:
             return RecordedFrame(index, max(came.t_ns, last_ns + 1), None, f"{self.name}: image {index}: {error}")
@@ -338,13 +336,13 @@ class RosCamera:
         return RecordedFrame(index, t_ns, image, speeds=readings)
 
     def resume(self, frame_id: int, t_source_ns: int) -> None:
-        """A camera just goes on."""
+        """Does nothing: a live camera needs no seek."""
 
     def close(self) -> None:
-        """Leaves the router."""
+        """Closes the node."""
         with self._arrived:
             if self._lost and not self._closed:
-                log.warning("%s: %d images came, %d were lost on their way here", self.name, self._came, self._lost)
+                log.warning("%s: %d images received, %d lost in transit", self.name, self._came, self._lost)
             self._closed = True
             self._arrived.notify_all()
         if self._node is not None:

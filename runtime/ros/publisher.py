@@ -1,7 +1,7 @@
-"""`birdslam ros`: what a vehicle's BirdSLAM says, as messages of ROS 2, live; docs/ros.md lists them.
+"""`birdslam ros`: publishes a vehicle's estimates as ROS 2 messages; docs/ros.md lists them.
 
-A process of its own, and of its vehicle's bus a planner like any other: it can slow nothing down, and nothing comes in
-through it. It waits for the vehicle and for the router, and lives through restarts of both.
+A separate process and a planner of its vehicle's bus, so that it slows nothing down. It waits for the vehicle and the
+router, and survives restarts of both.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from birdslam.runtime.wire import Health
 from birdslam.types import EgoEdge, Estimate, MapUpdate, Measurements
 
 NODE = "birdslam"
-_DEPTH = 64  # estimates that wait while a computer is busy: two seconds of them
-_SILENT_S = 1.0  # without an estimate for so long, the diagnostics say so, and again each time
+_DEPTH = 64  # queue of two seconds of estimates
+_SILENT_S = 1.0  # interval of diagnostics about a missing estimate
 _WAIT_S = 0.1  # for an estimate, in a step
-_KEPT_MOTIONS = 64
+_MAX_MOTIONS = 64
 
 
 class RosBridge(Closing):
@@ -47,7 +47,7 @@ class RosBridge(Closing):
         own, self._frames = ("", "") if namespace == "/" else (namespace, f"{namespace.strip('/')}/")
         self._publishers: dict[str, RosPublisher] = {}
         for topic, type_name in TOPICS.items():
-            full = own + topic if topic.startswith("/birdslam/") else topic  # the others are ROS' own, absolute
+            full = own + topic if topic.startswith("/birdslam/") else topic  # the others are standard topics
             qos = LATCHED_QOS if topic in LATCHED else Qos()
             self._publishers[topic] = node.publisher(full, type_name, qos)
         self._bus = Bus(vehicle, "ros", runtime_dir=runtime_dir)
@@ -57,13 +57,13 @@ class RosBridge(Closing):
         self._map_poses = self._bus.subscriber("map_pose")
         self._healths = {name: self._bus.subscriber(f"health/{name}") for name in PROCESSES}
         self._messages: RosMessages | None = None
-        self._motions: dict[int, EgoEdge] = {}  # by the frame that each leads to
-        self._last_frame, self._told_ns = -1, 0
-        self._heard_s = time.monotonic()
+        self._motions: dict[int, EgoEdge] = {}  # by their last frame
+        self._last_frame, self._published_ns = -1, 0
+        self._received_s = time.monotonic()
 
     @property
     def connected(self) -> bool:
-        """Whether the router is there now."""
+        """Whether the router is connected."""
         return self._node.connected
 
     @property
@@ -72,31 +72,31 @@ class RosBridge(Closing):
         return self._bus.alive & set(PROCESSES)
 
     def step(self, timeout_s: float = _WAIT_S) -> None:
-        """Says what comes within that time: one estimate, with all that came beside it."""
+        """Waits for an estimate and publishes it with all other messages that have arrived."""
         message = self._estimates.recv(timeout_s)
         while (measured := self._measurements.recv(0.0)) is not None:
             record: Measurements = measured.record
             if record.cc is not None:
                 self._motions[record.cc.to_frame] = record.cc
-        while len(self._motions) > _KEPT_MOTIONS:
+        while len(self._motions) > _MAX_MOTIONS:
             del self._motions[next(iter(self._motions))]
         if message is not None:
-            self._heard_s = time.monotonic()
-            self._say_estimate(message.record)
-        elif time.monotonic() - self._heard_s > _SILENT_S:
-            self._heard_s = time.monotonic()
-            self._say_silence()
-        self._say_map()
-        self._say_healths()
+            self._received_s = time.monotonic()
+            self._publish_estimate(message.record)
+        elif time.monotonic() - self._received_s > _SILENT_S:
+            self._received_s = time.monotonic()
+            self._publish_silence()
+        self._publish_map()
+        self._publish_healths()
 
-    def _say_estimate(self, estimate: Estimate) -> None:
-        if estimate.t_capture_ns <= self._told_ns:  # what was predicted is put right: tf has one pose a time
+    def _publish_estimate(self, estimate: Estimate) -> None:
+        if estimate.t_capture_ns <= self._published_ns:  # a corrected prediction: tf allows one pose per time
             return
         if self._messages is None or estimate.frame_id <= self._last_frame:  # another drive
             self._messages = self._begin(estimate)
         if self._messages is None:
             return
-        self._last_frame, self._told_ns = estimate.frame_id, estimate.t_capture_ns
+        self._last_frame, self._published_ns = estimate.frame_id, estimate.t_capture_ns
         if not self._estimates_due.passes(time.monotonic_ns()):
             return
         motion = self._motions.pop(estimate.frame_id, None)
@@ -104,7 +104,7 @@ class RosBridge(Closing):
             self._send(sent)
 
     def _begin(self, estimate: Estimate) -> RosMessages | None:
-        """Asks the vehicle for its camera; None where it does not say it (yet)."""
+        """Queries the vehicle's camera for a new drive; returns None without a reply."""
         try:
             answer = self._bus.query("configuration")
         except BusError as error:
@@ -118,7 +118,7 @@ class RosBridge(Closing):
         self._motions.clear()
         return messages
 
-    def _say_map(self) -> None:
+    def _publish_map(self) -> None:
         while (message := self._maps.recv(0.0)) is not None:
             update: MapUpdate = message.record
             if self._messages is not None:
@@ -129,14 +129,14 @@ class RosBridge(Closing):
             for sent in self._messages.of_map_pose(newest.record, t_of(newest.record, live=True)):
                 self._send(sent)
 
-    def _say_healths(self) -> None:
+    def _publish_healths(self) -> None:
         for subscriber in self._healths.values():
             while (message := subscriber.recv(0.0)) is not None:
                 health: Health = message.record
                 if self._messages is not None:
                     self._send(self._messages.diagnostic(health.node, *_judged(health), time.time_ns()))
 
-    def _say_silence(self) -> None:
+    def _publish_silence(self) -> None:
         missing = sorted({"capture", "perceive", "optimize"} - self.alive)
         text = f"no estimate; not alive: {', '.join(missing)}" if missing else "no estimate"
         if self._messages is not None:
@@ -146,11 +146,11 @@ class RosBridge(Closing):
         topic, message = sent
         try:
             self._publishers[topic].publish(message)
-        except zenoh.ZError as error:  # this message alone
+        except zenoh.ZError as error:  # only this message is lost
             print(f"birdslam: ros: {topic}: {error}", file=sys.stderr, flush=True)
 
     def close(self) -> None:
-        """Leaves both."""
+        """Closes the bus and the node."""
         self._bus.close()
         self._node.close()
 
@@ -171,7 +171,7 @@ def _judged(health: Health) -> tuple[Level, str, dict[str, Any]]:
 
 
 def run(configuration: Configuration, rate_hz: float | None = None) -> None:
-    """Until SIGTERM or SIGINT. Raises ConfigurationError, BagError without rosbags, and as Bus does."""
+    """Runs until SIGTERM or SIGINT. Raises ConfigurationError, BagError without rosbags, and as Bus does."""
     vehicle, config = configuration.vehicle, configuration.ros
     signals.block()
     zenoh.init_log_from_env_or("error")

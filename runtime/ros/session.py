@@ -1,7 +1,7 @@
-"""A node of ROS 2 on a zenoh session of its own, at the router of rmw_zenoh.
+"""A ROS 2 node on a zenoh session at the router of rmw_zenoh.
 
-It is a client of the router and listens on nothing. Where ZENOH_SESSION_CONFIG_URI names a file, as for every node of
-rmw_zenoh, that file has the session's certificates and access rules.
+The session is a client and does not listen. ZENOH_SESSION_CONFIG_URI may name a file with its certificates and access
+rules, as for every node of rmw_zenoh.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ from birdslam.runtime.transport.session import close_session, open_session
 
 SESSION_FILE = "ZENOH_SESSION_CONFIG_URI"
 DOMAIN = "ROS_DOMAIN_ID"
-ROUTER_S = 2.0  # one attempt to reach it
-_MAX_BYTES = 1 << 26  # of a message: an image of 5000x4000 px in colour; zenoh would put together 1 GiB
+ROUTER_S = 2.0  # timeout of one attempt to connect
+_MAX_BYTES = 1 << 26  # of a message: a colour image of 5000x4000 px; zenoh's default is 1 GiB
 _RETRY = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2}
-_HEARTBEAT_S = 0.5  # of what is latched, after a message: as rmw_zenoh
+_HEARTBEAT_S = 0.5  # of latched topics, as in rmw_zenoh
 _CDR = zenoh.Encoding("application/cdr")
 
 
 def domain_of(config: RosConfig) -> int:
-    """The domain, as for any node of ROS from its variable where the configuration says none."""
+    """Returns the configured domain, else that of the environment variable."""
     if config.domain is not None:
         return config.domain
     text = os.environ.get(DOMAIN, "0")
@@ -53,13 +53,13 @@ def domain_of(config: RosConfig) -> int:
 
 
 class NoRouter(RuntimeError):
-    """The router is not there."""
+    """The router is not reachable."""
 
 
 def session_config(router: str, timeout_s: float) -> zenoh.Config:
-    """Of zenoh: it waits so long for the router, and looks for ever for one that was there once.
+    """Returns zenoh's configuration: wait `timeout_s` for the router, reconnect without limit after a loss.
 
-    Raises ConfigurationError where the file of the session can't be one.
+    Raises ConfigurationError for an invalid session file.
     """
     file = os.environ.get(SESSION_FILE)
     try:
@@ -75,7 +75,7 @@ def session_config(router: str, timeout_s: float) -> zenoh.Config:
             "transport/link/rx/max_message_size": _MAX_BYTES,
             "transport/shared_memory/enabled": False,
             "adminspace/enabled": False,
-            "timestamping/enabled": True,  # what is kept for those that come late needs it
+            "timestamping/enabled": True,  # needed for latched topics
         }
         for name, value in settings.items():
             config.insert_json5(name, json.dumps(value))
@@ -86,7 +86,7 @@ def session_config(router: str, timeout_s: float) -> zenoh.Config:
 
 
 class RosPublisher:
-    """Of one topic. `publish` never waits: what the network does not take is dropped, as rmw_zenoh does it."""
+    """A publisher of one topic. `publish` does not wait: messages are dropped on congestion, as in rmw_zenoh."""
 
     def __init__(self, session: zenoh.Session, key: str, token: str, qos: Qos, read: Callable[[Any], bytes]) -> None:
         self._cdr, self._gid, self._numbers = read, gid(token), itertools.count(1)
@@ -110,15 +110,15 @@ class RosPublisher:
         self._token = session.liveliness().declare_token(token)
 
     def publish(self, message: Any) -> None:
-        """One message."""
-        said = attachment(next(self._numbers), time.time_ns(), self._gid)
-        self._publisher.put(self._cdr(message), attachment=said)
+        """Publishes one message."""
+        header = attachment(next(self._numbers), time.time_ns(), self._gid)
+        self._publisher.put(self._cdr(message), attachment=header)
 
 
 class RosNode(Closing):
     """A node with its publishers and subscriptions. A context manager.
 
-    Raises ConfigurationError for a name or a file that can't be, NoRouter where none is there within the time.
+    Raises ConfigurationError for an invalid name or file, NoRouter without a connection in time.
     """
 
     def __init__(self, config: RosConfig, name: str, timeout_s: float = ROUTER_S) -> None:
@@ -137,7 +137,7 @@ class RosNode(Closing):
             self.session = open_session(settings)
         except zenoh.ZError as error:
             raise NoRouter(
-                f"ros.router {config.router}: the router is not there: no connection within {timeout_s:g} s"
+                f"ros.router {config.router}: the router is not reachable: no connection within {timeout_s:g} s"
             ) from error
         self.node = Node(self.domain, str(self.session.info.zid()), namespace, name)
         self._tokens = [self.session.liveliness().declare_token(self.node.token())]
@@ -145,22 +145,22 @@ class RosNode(Closing):
 
     @property
     def connected(self) -> bool:
-        """Whether the router is there now."""
+        """Whether the router is connected."""
         return bool(self.session.info.routers_zid())
 
     def type_hash(self, type_name: str) -> str:
-        """Of the release that the others run."""
+        """Returns the type hash of the configured ROS release."""
         return self.types.type_hash(type_name) if self._hashed else NO_HASH
 
     def publisher(self, topic: str, type_name: str, qos: Qos) -> RosPublisher:
-        """Of a full topic name."""
+        """Returns a publisher of a full topic name."""
         hashed = self.type_hash(type_name)
         token = self.node.publisher_token(next(self._numbers), topic, type_name, hashed, qos)
         key = topic_key(self.domain, topic, type_name, hashed)
         return RosPublisher(self.session, key, token, qos, self.types.cdr)
 
     def subscribe(self, key: str, receive: Callable[[zenoh.Sample], object], late: bool = False) -> None:
-        """Calls `receive` of each message, on zenoh's thread; with `late` also of what came before (/tf_static)."""
+        """Calls `receive` for each message on zenoh's thread; with `late` also for latched ones (/tf_static)."""
         callback = zenoh.handlers.Callback(receive, indirect=False)
         if late:
             history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
@@ -171,7 +171,7 @@ class RosNode(Closing):
             self._subscribers.append(self.session.declare_subscriber(key, callback))
 
     def watch(self, key: str, came: Callable[[str], object]) -> None:
-        """Calls `came` of each token of somebody who is there or comes, on zenoh's thread."""
+        """Calls `came` for each present or new liveliness token, on zenoh's thread."""
 
         def changed(sample: zenoh.Sample) -> None:
             if sample.kind == zenoh.SampleKind.PUT:
@@ -180,12 +180,12 @@ class RosNode(Closing):
         callback = zenoh.handlers.Callback(changed, indirect=False)
         self._subscribers.append(self.session.liveliness().declare_subscriber(key, callback, history=True))
 
-    def say_listening(self, topic: str, type_name: str, type_hash: str, qos: Qos) -> None:
-        """Tells the publishers of a topic that somebody listens: some send only then."""
+    def declare_subscription(self, topic: str, type_name: str, type_hash: str, qos: Qos) -> None:
+        """Declares a subscription to the publishers of a topic; some send only to subscribers."""
         with self._lock:
             token = self.node.subscription_token(next(self._numbers), topic, type_name, type_hash, qos)
             self._tokens.append(self.session.liveliness().declare_token(token))
 
     def close(self) -> None:
-        """Leaves; a second call does nothing."""
+        """Closes the session; a second call does nothing."""
         close_session(self.session)
