@@ -144,7 +144,7 @@ def test_results_appear_whole_and_are_the_same_bytes(tmp_path: Path, monkeypatch
     assert not list((tmp_path / "once" / ".working").iterdir())
     monkeypatch.setattr(driving, "pipeline", None)  # what has its results is not driven again
     run_drive(Job(task, str(tmp_path / "once")), lambda *at: None)
-    with pytest.raises(ConfigurationError, match="of other settings"):
+    with pytest.raises(ConfigurationError, match="other settings"):
         done(tmp_path / "once", msgspec.structs.replace(task, identity="0"))
 
 

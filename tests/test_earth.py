@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
-from birdslam.loops.gnss.earth import Earth, EarthError, GnssFix, place_on_earth
+from birdslam.loops.gnss.earth import Earth, EarthError, GnssFix, align_with_fixes
 from birdslam.loops.gnss.files import GnssError, read_fixes, read_track
 from birdslam.outputs.earth_files import Way, write_ways
 
@@ -55,9 +55,9 @@ def worst_m(earth: Earth, poses: list[SE2], enu: np.ndarray) -> float:
     return float(np.hypot(east - enu[:, 0], north - enu[:, 1]).max())
 
 
-def test_a_drive_comes_to_its_place_on_earth() -> None:
+def test_a_drive_comes_to_its_align_with_fixes() -> None:
     t_ns, poses, enu = a_drive()
-    earth = place_on_earth(t_ns, poses, fixes_of(t_ns, enu, 1.0))
+    earth = align_with_fixes(t_ns, poses, fixes_of(t_ns, enu, 1.0))
     assert worst_m(earth, poses, enu) < 1.5
     assert earth.yaw_rad == pytest.approx(YAW_RAD, abs=0.02)
     assert earth.calibration_hint(CAMERA) == ""
@@ -67,24 +67,24 @@ def test_fixes_fifteen_metres_off_for_ten_seconds_do_not_bend_it() -> None:
     t_ns, poses, enu = a_drive()
     wrong = enu.copy()
     wrong[120:220] += (12.0, -9.0)
-    earth = place_on_earth(t_ns, poses, fixes_of(t_ns, wrong, 1.0))
+    earth = align_with_fixes(t_ns, poses, fixes_of(t_ns, wrong, 1.0))
     assert earth.outliers == 10
     assert worst_m(earth, poses, enu) < 2.0
 
 
 def test_a_wrong_camera_height_is_told() -> None:
     t_ns, poses, enu = a_drive(scale=0.94)
-    earth = place_on_earth(t_ns, poses, fixes_of(t_ns, enu, 1.0))
+    earth = align_with_fixes(t_ns, poses, fixes_of(t_ns, enu, 1.0))
     assert earth.scale == pytest.approx(0.94, abs=0.01)
     assert "1.55 m instead of 1.65 m" in earth.calibration_hint(CAMERA)
-    assert "a view of 85 degrees across instead of 82" in earth.calibration_hint(CAMERA)
+    assert "a field of view of 85 degrees instead of 82" in earth.calibration_hint(CAMERA)
 
 
 def test_speeds_of_fixes_show_the_scale_where_their_places_hardly_do() -> None:
     t_ns, poses, enu = a_drive(scale=0.94)
     fixes = [msgspec.structs.replace(fix, sigma_m=30.0) for fix in fixes_of(t_ns, enu, 20.0)]
-    by_places = place_on_earth(t_ns, poses, fixes)
-    by_speeds = place_on_earth(t_ns, poses, [msgspec.structs.replace(fix, speed_mps=10.0) for fix in fixes])
+    by_places = align_with_fixes(t_ns, poses, fixes)
+    by_speeds = align_with_fixes(t_ns, poses, [msgspec.structs.replace(fix, speed_mps=10.0) for fix in fixes])
     assert by_speeds.speed_ratio == pytest.approx(1.0 / 0.94, abs=0.01)
     assert by_speeds.scale == pytest.approx(0.94, abs=0.02)
     assert by_speeds.cov[3, 3] < 0.1 * by_places.cov[3, 3]
@@ -96,7 +96,7 @@ def test_late_fixes_are_found_out_by_the_turn() -> None:
         GnssFix(**{**{n: getattr(fix, n) for n in fix.__struct_fields__}, "t_source_ns": fix.t_source_ns + 600_000_000})
         for fix in fixes_of(t_ns, enu, 0.3)
     ]
-    earth = place_on_earth(t_ns, poses, late)
+    earth = align_with_fixes(t_ns, poses, late)
     assert earth.delay_s == pytest.approx(0.6, abs=0.15)
 
 
@@ -106,7 +106,7 @@ def test_late_fixes_are_found_out_by_the_turn() -> None:
 def test_too_little_is_an_error(take: slice, why: str) -> None:
     t_ns, poses, enu = a_drive()
     with pytest.raises(EarthError, match=why):
-        place_on_earth(t_ns[:], [SE2()] * 400 if why == "are needed" else poses, fixes_of(t_ns, enu, 1.0)[take])
+        align_with_fixes(t_ns[:], [SE2()] * 400 if why == "are needed" else poses, fixes_of(t_ns, enu, 1.0)[take])
 
 
 # --- files in ---
@@ -178,7 +178,7 @@ def test_a_track_of_another_clock_is_laid_where_it_has_the_drives_shape() -> Non
     lat, lon, _ = pymap3d.enu2geodetic(track[:, 0], track[:, 1], 0.0, *ORIGIN, 0.0)
     rows = zip(times_ns.tolist(), lat.tolist(), lon.tolist(), strict=True)
     fixes = [GnssFix(t_source_ns=t, latitude_deg=a, longitude_deg=b, sigma_m=2.0) for t, a, b in rows]
-    earth = place_on_earth(t_ns, poses, fixes, clock_is_known=False)
+    earth = align_with_fixes(t_ns, poses, fixes, clock_is_known=False)
     assert worst_m(earth, poses, enu) < 5.0
     assert earth.delay_s == pytest.approx(600.0, abs=0.5)
 
@@ -187,8 +187,8 @@ def test_a_straight_drive_within_a_straight_track_of_another_clock_is_an_error()
     t_ns, poses, enu = a_drive()
     straight = fixes_of(t_ns, enu, 1.0)[:25]  # before the turn
     with pytest.raises(EarthError, match="--gnss-offset"):
-        place_on_earth(t_ns[:100], poses[:100], straight, clock_is_known=False)
-    assert place_on_earth(t_ns[:100], poses[:100], straight).fixes >= 9
+        align_with_fixes(t_ns[:100], poses[:100], straight, clock_is_known=False)
+    assert align_with_fixes(t_ns[:100], poses[:100], straight).fixes >= 9
 
 
 def test_the_stated_offset_ties_a_track_to_the_recording() -> None:
@@ -264,7 +264,7 @@ def test_a_few_fixes_anywhere_do_not_move_the_drive(wrong: dict[int, tuple[float
     moved = enu.copy()
     for k, offset in wrong.items():
         moved[10 * k] += offset
-    earth = place_on_earth(t_ns, poses, fixes_of(t_ns, moved, 1.0, seed))
+    earth = align_with_fixes(t_ns, poses, fixes_of(t_ns, moved, 1.0, seed))
     assert worst_m(earth, poses, enu) < 5.0
     assert earth.outliers <= len(wrong) + 1
 

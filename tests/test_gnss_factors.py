@@ -19,8 +19,8 @@ import pytest
 from birdslam.bench.simulation.places import CAMERA
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.drift import link_cov
-from birdslam.loops.gnss.earth import EarthError, GnssFix, place_on_earth
-from birdslam.loops.gnss.factors import Node, OnEarth, fixed_keyframes, tie
+from birdslam.loops.gnss.earth import EarthError, GnssFix, align_with_fixes
+from birdslam.loops.gnss.factors import Node, OnEarth, fixed_keyframes, georeference
 from birdslam.loops.gnss.sentences import NmeaReader
 from birdslam.loops.keyframe import Link
 from birdslam.outputs import placed
@@ -68,8 +68,8 @@ def fixes_of(true: list[SE2], noise_m: float, off: range = range(0), seed: int =
 
 def tied(true: list[SE2], nodes: list[Node], links: list[Link], fixes: list[GnssFix]) -> OnEarth:
     t_ns, poses = times(len(nodes)), [node.T_map_keyframe for node in nodes]
-    earth = place_on_earth(t_ns, poses, fixes)
-    return tie(earth, nodes, links, fixed_keyframes(earth, t_ns, poses, fixes, nodes))
+    earth = align_with_fixes(t_ns, poses, fixes)
+    return georeference(earth, nodes, links, fixed_keyframes(earth, t_ns, poses, fixes, nodes))
 
 
 def errors_m(found: OnEarth, nodes: list[Node], true: list[SE2]) -> np.ndarray:

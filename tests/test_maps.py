@@ -20,7 +20,7 @@ from birdslam.loops.closing import close_loops, held
 from birdslam.loops.features import Features, match, match_near
 from birdslam.loops.foot import body_pose, foot
 from birdslam.loops.keyframe import Link
-from birdslam.loops.localiser import RARE_M, Localisation
+from birdslam.loops.localiser import LOOK_UP_EVERY_M, Localisation
 from birdslam.loops.map_file import HEAD, MAGIC, MapError, decode_map, encode_map
 from birdslam.loops.map_pose import MapPose, MapState, in_map
 from birdslam.loops.merging import MergeError, merged
@@ -121,7 +121,7 @@ def test_places_are_looked_up_seldom_on_a_way_that_the_map_does_not_know(
     assert len(look_ups) == 20
     look_ups.clear()
     driven(PlaceMap(MapCamera.of(CAMERA)), STREET, range(100), extend=True)
-    assert 0 < len(look_ups) <= 100 / RARE_M + 2
+    assert 0 < len(look_ups) <= 100 / LOOK_UP_EVERY_M + 2
 
 
 def test_who_is_lost_has_no_pose_and_no_small_covariance(mapped: bytes) -> None:
@@ -437,7 +437,7 @@ def test_what_is_no_whole_map_is_refused(mapped: bytes) -> None:
         (mapped[:-100], "torn"),
         (bytes(flipped), "CRC"),
         (newer, "version 5"),
-        (MAGIC + HEAD.pack(version, 1, zlib.crc32(b"\xc1")) + b"\xc1", "something that is no map"),
+        (MAGIC + HEAD.pack(version, 1, zlib.crc32(b"\xc1")) + b"\xc1", "has an invalid body"),
     ):
         with pytest.raises(MapError, match=why):
             decode_map(data)
@@ -636,7 +636,7 @@ def test_the_maps_of_many_drives_become_one(files: dict[str, Path], tmp_path: Pa
 
 
 def test_maps_that_share_no_street_stay_two(files: dict[str, Path]) -> None:
-    with pytest.raises(MergeError, match="share no street"):
+    with pytest.raises(MergeError, match="no recognised street"):
         merged(read_map(files["own"]), read_map(files["other"]))
 
 

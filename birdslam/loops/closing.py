@@ -1,9 +1,8 @@
-"""Loops closed, and fixes of GNSS taken in: the graph of keyframes in Sim(2), solved by gtsam.
+"""Loop closure and GNSS fixes: the pose graph of keyframes in Sim(2), solved by gtsam.
 
-Each keyframe has a pose in the map and a scale, the map's metres over those of its odometry (Strasdat et al. 2010).
-Links measure in the metres of the keyframe that they begin at. Loops are weighed by dynamic covariance scaling (Agarwal
-et al. 2013), the closed form of switchable constraints: one that contradicts the rest is switched off. Which fixes are
-outliers graduated non-convexity says (Yang et al. 2020): those that can't all be true with odometry's links.
+Each keyframe has a pose in the map and a scale, map metres over odometry metres (Strasdat et al. 2010). Links are in
+the metres of their first keyframe. Loops have dynamic covariance scaling (Agarwal et al. 2013); outliers among the
+fixes are found by graduated non-convexity (Yang et al. 2020).
 """
 
 from __future__ import annotations
@@ -21,44 +20,43 @@ from birdslam.geometry.se2 import SE2
 from birdslam.loops.drift import KEPT_M, MIN_SCALE_REL
 from birdslam.loops.keyframe import Link, Placed
 
-DCS_PHI = 5.0  # chi-square at which a loop begins to count less
-# x, y, yaw, and the scale's logarithm
-ORIGIN_SIGMA = 1e-3, 1e-3, 1e-4, 1e1  # the map's frame is that of its first keyframe
-# ... of keyframes that only loops, or nothing, tie to the first: a loop may be switched off
-LOOSE_SIGMA = 1e3, 1e3, 1e1, 1e-1
-FREE_SIGMA = 1e6  # of what a prior says nothing of
-LOOP_SCALE_SIGMA = 1e1  # a place that is seen again tells nothing of odometry's metres there
-MIN_WAY_M = 0.1  # of a link, over which the scale may change
-GNC_COST = 0.5 * 11.3  # half the chi-square beyond which a factor is an outlier: 99 % of three degrees of freedom
+DCS_PHI = 5.0  # chi-square above which the weight of a loop decreases
+# Prior sigmas of x, y, yaw and log scale
+ORIGIN_SIGMA = 1e-3, 1e-3, 1e-4, 1e1  # of the first keyframe, which defines the map frame
+LOOSE_SIGMA = 1e3, 1e3, 1e1, 1e-1  # of keyframes that no odometry link connects to the first
+FREE_SIGMA = 1e6  # of components without a prior
+LOOP_SCALE_SIGMA = 1e1  # a loop does not measure the scale
+MIN_LENGTH_M = 0.1  # of a link, for the change of scale
+GNC_COST = 0.5 * 11.3  # half the chi-square of an outlier: 99 % of three degrees of freedom
 
 
 @dataclass(frozen=True)
 class PlaceFactor:
-    """Where a keyframe is by a fix, in the graph's frame."""
+    """The position of a keyframe by a fix, in the graph's frame."""
 
     number: int
     xy_m: tuple[float, float]
-    sigma_m: float  # of the fix by itself, by which it is judged
-    weighed_m: float  # and with what it shares with those around it, by which it pulls
+    sigma_m: float  # 1-sigma of the fix, for the outlier test
+    weighed_m: float  # 1-sigma with the error shared with nearby fixes, for the factor
 
 
 class Solved(NamedTuple):
-    """Where a keyframe is in the solved graph."""
+    """A keyframe in the solved graph."""
 
     T_map_keyframe: SE2
     cov: Floats  # (3, 3) of the tangent at the pose
-    scale: float  # metres of the map over those of its odometry
+    scale: float  # map metres over odometry metres
 
 
 def close_loops(
     keyframes: Sequence[Placed], links: Sequence[Link], fixes: Sequence[PlaceFactor] = (), agreed: bool = False
 ) -> dict[int, Solved]:
-    """Each keyframe by its number, with all links and fixes at once.
+    """Solves the graph with all links and fixes; returns each keyframe by its number.
 
-    Without fixes the first keyframe stays where it is; with them all may move. `agreed`: the loops are known to agree
-    with each other, and may lie far from where the keyframes are now; others that do are switched off.
+    Without fixes the first keyframe is fixed. `agreed`: the loops are mutually consistent and may be far from the
+    current poses; without it such loops are down-weighted.
     """
-    import gtsam  # here: only who closes a loop needs it
+    import gtsam
 
     if not keyframes:
         return {}
@@ -75,15 +73,15 @@ def close_loops(
         solved = found.atSimilarity2(keyframe.number)
         scale = float(solved.scale())
         x_m, y_m = scale * np.array(solved.translation())
-        in_map = np.diag([scale, scale, 1.0])  # its tangent is in the keyframe's own metres
+        in_map = np.diag([scale, scale, 1.0])  # the tangent is in the keyframe's metres
         cov = in_map @ np.array(marginals.marginalCovariance(keyframe.number))[:3, :3] @ in_map
         out[keyframe.number] = Solved(SE2(float(x_m), float(y_m), solved.rotation().theta()), cov, scale)
     return out
 
 
 def inliers(keyframes: Sequence[Placed], links: Sequence[Link], fixes: Sequence[PlaceFactor]) -> Bools:
-    """(N,) whether each fix fits the others and odometry."""
-    import gtsam  # here: only who has fixes needs it
+    """Returns (N,) whether each fix is consistent with the others and odometry."""
+    import gtsam
 
     graph, start = _graph(keyframes, links, LOOSE_SIGMA)
     size = graph.size()
@@ -101,8 +99,8 @@ def inliers(keyframes: Sequence[Placed], links: Sequence[Link], fixes: Sequence[
 def _graph(
     keyframes: Sequence[Placed], links: Sequence[Link], first_sigma: tuple[float, ...], robust: Any = None
 ) -> tuple[Any, Any]:
-    """Its factors, loops last, and where it starts from; loops weighed by `robust`."""
-    import gtsam  # here: only who closes a loop needs it
+    """Returns the graph, loops last and weighted by `robust`, and the initial values."""
+    import gtsam
 
     graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
     tied, information = _tied(keyframes[0].number, links), _scale_information(links)
@@ -111,7 +109,7 @@ def _graph(
         start.insert(number, pose)
         if keyframe is keyframes[0] or number not in tied:
             graph.add(_prior(number, pose, first_sigma if keyframe is keyframes[0] else LOOSE_SIGMA))
-        if number in information:  # odometry's metres are right in the mean
+        if number in information:  # the scale is 1 in the mean
             right = _similarity(keyframe.T_map_keyframe, 1.0)
             graph.add(_prior(number, right, (FREE_SIGMA,) * 3 + (information[number] ** -0.5,)))
     for link in sorted(links, key=lambda link: link.loop):
@@ -128,17 +126,17 @@ def _graph(
 
 
 def _scale_step(link: Link) -> float:
-    """Variance by which the scale's logarithm differs from one end of a link to the other.
+    """Returns the variance of the change of log scale along a link.
 
-    With `_scale_information` at both ends it is the process of Ornstein and Uhlenbeck, exp(-way / KEPT_M), as large as
-    odometry says of itself.
+    With `_scale_information` at both ends this is an Ornstein-Uhlenbeck process with the correlation exp(-length /
+    KEPT_M) and odometry's variance.
     """
     sigma_rel, lasting = _scale_process(link)
     return 2.0 * sigma_rel**2 * math.sinh(lasting)
 
 
 def _scale_information(links: Sequence[Link]) -> dict[int, float]:
-    """What odometry's own word tells of the logarithm of each keyframe's scale."""
+    """Returns the information of each keyframe's log scale from odometry's sigma."""
     out: dict[int, float] = defaultdict(float)
     for link in links:
         if not link.loop:
@@ -149,20 +147,20 @@ def _scale_information(links: Sequence[Link]) -> dict[int, float]:
 
 
 def _scale_process(link: Link) -> tuple[float, float]:
-    """Its 1-sigma, and the link's way in lengths over which the error lasts."""
-    way_m = max(math.hypot(link.T_from_to.x_m, link.T_from_to.y_m), MIN_WAY_M)
+    """Returns the 1-sigma of the scale, and the link's length in correlation lengths."""
+    way_m = max(math.hypot(link.T_from_to.x_m, link.T_from_to.y_m), MIN_LENGTH_M)
     return max(link.scale_rel, MIN_SCALE_REL), min(way_m / KEPT_M, 20.0)
 
 
 def _prior(number: int, pose: Any, sigmas: tuple[float, ...]) -> Any:
-    import gtsam  # here: only who closes a loop needs it
+    import gtsam
 
     return gtsam.PriorFactorSimilarity2(number, pose, gtsam.noiseModel.Diagonal.Sigmas(np.array(sigmas)))
 
 
 def _place_factor(fix: PlaceFactor, sigma_m: float, start: Any) -> Any:
-    """Turn and scale are those that the graph starts from, and free."""
-    import gtsam  # here: only who has fixes needs it
+    """Returns a prior of the position; rotation and scale are free."""
+    import gtsam
 
     guess = start.atSimilarity2(fix.number)
     scale = float(guess.scale())
@@ -171,7 +169,7 @@ def _place_factor(fix: PlaceFactor, sigma_m: float, start: Any) -> Any:
 
 
 def held(links: Sequence[Link], poses: dict[int, Solved]) -> list[Link]:
-    """The links that the solved graph agrees with; loops that it contradicts are left out."""
+    """Returns the links without the loops that are inconsistent with the solved graph."""
     return [link for link in links if not link.loop or _chi2(link, poses) < 9.0 * DCS_PHI]
 
 
@@ -183,16 +181,16 @@ def _chi2(link: Link, poses: dict[int, Solved]) -> float:
 
 
 def _tied(first: int, links: Sequence[Link]) -> set[int]:
-    """The keyframes that odometry's links lead to from the first."""
-    beside: dict[int, list[int]] = {}
+    """Returns the keyframes that odometry links connect to the first."""
+    neighbours: dict[int, list[int]] = {}
     for link in links:
         if link.loop:
             continue
-        beside.setdefault(link.from_number, []).append(link.to_number)
-        beside.setdefault(link.to_number, []).append(link.from_number)
+        neighbours.setdefault(link.from_number, []).append(link.to_number)
+        neighbours.setdefault(link.to_number, []).append(link.from_number)
     seen, waiting = {first}, [first]
     while waiting:
-        for other in beside.get(waiting.pop(), []):
+        for other in neighbours.get(waiting.pop(), []):
             if other not in seen:
                 seen.add(other)
                 waiting.append(other)
@@ -200,7 +198,7 @@ def _tied(first: int, links: Sequence[Link]) -> set[int]:
 
 
 def _similarity(T: SE2, scale: float) -> Any:
-    """gtsam takes p to scale * (R p + t)."""
-    import gtsam  # here: only who closes a loop needs it
+    """Returns gtsam's Similarity2, which maps p to scale * (R p + t)."""
+    import gtsam
 
     return gtsam.Similarity2(gtsam.Rot2(T.yaw_rad), gtsam.Point2(T.x_m / scale, T.y_m / scale), scale)

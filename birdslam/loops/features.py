@@ -1,8 +1,7 @@
 """Local features of an image: corners with binary descriptors of 256 bits, compared by the Hamming distance.
 
-The default is SIFT (Lowe 2004) upright, since a car's camera does not roll, with each descriptor brought to 256 bits by
-the signs of random differences of its square-rooted entries (RootSIFT, Arandjelovic and Zisserman 2012): 32 bytes, as
-ORB's, at nearly SIFT's recognition across light and lane (`python -m perf loops`).
+The default is upright SIFT (Lowe 2004), since a car's camera does not roll. The signs of random differences of the
+square-rooted entries (RootSIFT, Arandjelovic and Zisserman 2012) reduce a descriptor to 32 bytes, as ORB's.
 """
 
 from __future__ import annotations
@@ -17,13 +16,13 @@ from numpy.typing import NDArray
 from birdslam.geometry.arrays import Floats, Floats32, Ints
 
 DESCRIPTOR_BYTES = 32
-MAX_FEATURES = 900  # of an image
-SUMMED = 8  # entries of SIFT that each bit adds, and as many that it takes away
-_SEED = 39  # of the random differences; part of the format: another seed is another descriptor
+MAX_FEATURES = 900  # per image
+SUMMED = 8  # entries of SIFT that each bit adds, and as many that it subtracts
+_SEED = 39  # of the random differences; part of the map format
 
 
 class FeatureKind(enum.StrEnum):
-    """The kinds that `python -m perf loops` compares; their descriptors can't be compared with each other."""
+    """The kinds of features; descriptors of different kinds are not comparable."""
 
     SIFT = "sift"
     ORB = "orb"
@@ -31,23 +30,23 @@ class FeatureKind(enum.StrEnum):
 
 @dataclass(frozen=True)
 class Features:
-    """Corners of one undistorted image, in the image's own pixels."""
+    """Corners of one undistorted image, in its pixels."""
 
     px: Floats  # (N, 2)
-    sigma_px: Floats  # (N,) 1-sigma of a coordinate: coarse scales are less exact
+    sigma_px: Floats  # (N,) 1-sigma of a coordinate, larger at coarse scales
     descriptors: NDArray[np.uint8]  # (N, 32)
 
     def __len__(self) -> int:
         return len(self.px)
 
 
-# Of each kind: how wide the image may be (wider ones are halved), and the size of its finest corners in pixels
+# Per kind: max. image width (wider images are halved), and the size of the finest corners in pixels
 WORKING_WIDTH_PX = {FeatureKind.SIFT: 700, FeatureKind.ORB: 1400}
 FINEST_PX = {FeatureKind.SIFT: 2.0, FeatureKind.ORB: 31.0}
 
 
 def _differences() -> Floats32:
-    """(128, 256): each column adds SUMMED entries of a SIFT descriptor and takes away as many others."""
+    """Returns (128, 256): each column adds SUMMED entries of a SIFT descriptor and subtracts as many others."""
     random = np.random.default_rng(_SEED)
     out = np.zeros((128, 8 * DESCRIPTOR_BYTES), np.float32)
     for column in out.T:
@@ -57,7 +56,7 @@ def _differences() -> Floats32:
 
 
 class FeatureExtractor:
-    """Finds the features of grey images; deterministic."""
+    """Extracts the features of images; deterministic."""
 
     def __init__(self, kind: FeatureKind = FeatureKind.SIFT) -> None:
         self._kind = kind
@@ -70,7 +69,7 @@ class FeatureExtractor:
             )
 
     def __call__(self, image: NDArray[np.uint8]) -> Features:
-        """Of an image (H, W) grey or (H, W, 3) BGR."""
+        """Returns the features of an image, (H, W) grey or (H, W, 3) BGR."""
         grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         scale = 1.0
         while grey.shape[1] > WORKING_WIDTH_PX[self._kind]:
@@ -80,7 +79,7 @@ class FeatureExtractor:
         if self._kind is FeatureKind.SIFT:
             for corner in corners:
                 corner.angle = 0.0
-            corners = _once(corners)
+            corners = _without_duplicates(corners)
         corners, descriptors = self._detector.compute(grey, corners)
         if descriptors is None or not len(corners):
             return Features(np.zeros((0, 2)), np.zeros(0), np.zeros((0, DESCRIPTOR_BYTES), np.uint8))
@@ -96,15 +95,15 @@ class FeatureExtractor:
         return np.packbits(root @ self._differences > 0.0, axis=1)
 
 
-def _once(corners: tuple[cv2.KeyPoint, ...]) -> list[cv2.KeyPoint]:
-    """SIFT gives a corner once for each of its directions; upright they are all the same."""
+def _without_duplicates(corners: tuple[cv2.KeyPoint, ...]) -> list[cv2.KeyPoint]:
+    """Removes duplicates: SIFT returns a corner once per orientation."""
     seen = {(corner.pt, corner.octave & 255): corner for corner in corners}
     return list(seen.values())
 
 
 def match(a: NDArray[np.uint8], b: NDArray[np.uint8], most_bits: int, ratio: float) -> Ints:
-    """(K, 2) rows of descriptors (N, 32) and (M, 32) that are each other's nearest, clearly so by Lowe's ratio test."""
-    import faiss  # here: only who compares whole images needs it
+    """Returns (K, 2) rows of mutually nearest descriptors (N, 32) and (M, 32) that pass Lowe's ratio test."""
+    import faiss
 
     if len(a) < 1 or len(b) < 2:
         return np.zeros((0, 2), np.int64)
@@ -126,8 +125,8 @@ def match_near(
     most_bits: int,
     ratio: float,
 ) -> Ints:
-    """As `match`, of descriptors (N, 32) and (M, 32) whose pixels lie within a radius: no others are compared."""
-    from scipy.spatial import cKDTree  # here: only who has a guess needs it
+    """Like `match`, but only among descriptors whose pixels are within a radius."""
+    from scipy.spatial import cKDTree
 
     if not len(a) or not len(b):
         return np.zeros((0, 2), np.int64)
@@ -152,4 +151,4 @@ def match_near(
     return np.column_stack([rows[first], columns[first]])[good]
 
 
-NEVER = 10_000  # bits: more than any two descriptors differ by
+NEVER = 10_000  # bits, above any distance

@@ -1,4 +1,4 @@
-"""Keyframes of a drive, every few metres, made once the frames around each of them are there; and lines beside them."""
+"""Builds keyframes of a drive every few metres from the frames around them, with the lane lines beside them."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from birdslam.loops.triangulation import Points, View, triangulate
 from birdslam.trajectory import mount_pose
 from birdslam.types import Attitude, Estimate, LaneLine
 
-SPACING_M = 4.0  # between keyframes: with MAX_POINTS below 2 MB a km
+SPACING_M = 4.0  # between keyframes
 MAX_POINTS = 150
-MIN_POINTS = 25  # a keyframe with fewer can't be found again
-REACH_M = 5.0  # of the frames that triangulate a keyframe's points, before and after it
-LOOK_M, LOOK_NS = 0.4, 500_000_000  # a frame is looked at after so much way, or so much time
+MIN_POINTS = 25  # for recognition
+REACH_M = 5.0  # max. distance of the frames that triangulate a keyframe's points
+LOOK_M, LOOK_NS = 0.4, 500_000_000  # interval of processed frames, by distance or time
 GRID_CELLS = 8, 4
-NODE_AT_M = 6.0  # ahead of the ego: there a line is in view and known best
+NODE_AT_M = 6.0  # ahead of the ego, where a line is visible and most accurate
 NODE_EVERY_M = 2.0
 MIN_EXISTENCE = 0.5
-HELD_M = 12.0  # from a node to the keyframe that it moves with
+HELD_M = 12.0  # max. distance of a node from its keyframe
 
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """A frame whose features were extracted."""
+    """A frame with its features."""
 
     frame_id: int
     t_source_ns: int
@@ -40,13 +40,13 @@ class Look:
     T_odom_ego: SE2
     attitude: Attitude
     features: Features
-    scale_rel: float = 0.0  # 1-sigma of odometry's metres, apart from what the camera's height makes of all of them
-    unsure_m2: float = 0.0  # variance of odometry's steps so far that are known to be wrong
+    scale_rel: float = 0.0  # 1-sigma of odometry's scale, without the part of the camera's height
+    unsure_m2: float = 0.0  # variance of odometry's known errors so far
 
 
 @dataclass(frozen=True, eq=False)
 class NewKeyframe:
-    """What a keyframe is before it has a place in the map."""
+    """A keyframe without a pose in the map."""
 
     look: Look
     points_m: Floats
@@ -56,15 +56,15 @@ class NewKeyframe:
 
 
 class LineNodes:
-    """Where the lines of the road were when the ego was NODE_AT_M before them; of one epoch."""
+    """Points of the lane lines NODE_AT_M ahead of the ego, in one epoch."""
 
     def __init__(self, drive: int) -> None:
         self._drive = drive
-        self._nodes: list[tuple[float, LaneLine, tuple[float, float]]] = []  # the way there, and the point in odometry
+        self._nodes: list[tuple[float, LaneLine, tuple[float, float]]] = []  # distance, line, point in odometry
         self._next_m = 0.0
 
     def add(self, estimate: Estimate, travelled_m: float) -> None:
-        """The lines of a frame, where one is due."""
+        """Adds the lines of a frame if one is due."""
         if estimate.lanes is None or not estimate.valid or travelled_m < self._next_m:
             return
         self._next_m = travelled_m + NODE_EVERY_M
@@ -74,7 +74,7 @@ class LineNodes:
                 self._nodes.append((travelled_m + NODE_AT_M, line, (float(x_m), float(y_m))))
 
     def take(self, look: Look) -> tuple[LinePiece, ...]:
-        """Those up to half of the way to the keyframe after this one."""
+        """Returns and removes the lines up to half of the distance to the next keyframe."""
         until_m = look.travelled_m + 0.5 * SPACING_M
         taken = [node for node in self._nodes if look.travelled_m - HELD_M < node[0] <= until_m]
         self._nodes = [node for node in self._nodes if node[0] > until_m]
@@ -90,18 +90,18 @@ class LineNodes:
 
 
 class KeyframeBuilder:
-    """Of one epoch: poses are in its odometry frame."""
+    """Builds the keyframes of one epoch; poses are in its odometry frame."""
 
     def __init__(self, camera: Camera, drive: int = 0) -> None:
         self._camera = camera
         self._mount = mount_pose(camera.ground)
         self._window: list[Look] = []
         self.nodes = LineNodes(drive)
-        self._next_m = 0.0  # the way at which the next keyframe is due
+        self._next_m = 0.0  # distance travelled of the next keyframe
         self._open = False
 
     def add(self, look: Look) -> list[NewKeyframe]:
-        """The keyframes that this look completes."""
+        """Adds a frame; returns the keyframes that it completes."""
         if not self._open:
             self._next_m, self._open = look.travelled_m, True
         if self._window and look.travelled_m - self._window[-1].travelled_m < LOOK_M:
@@ -110,7 +110,7 @@ class KeyframeBuilder:
         return self._due(look.travelled_m - REACH_M)
 
     def finish(self) -> list[NewKeyframe]:
-        """Those at the end of the drive, with the frames before them alone."""
+        """Returns the keyframes at the end of the drive, from the frames before them only."""
         return self._due(math.inf)
 
     def _due(self, until_m: float) -> list[NewKeyframe]:
@@ -127,7 +127,7 @@ class KeyframeBuilder:
 
     def _make(self, look: Look) -> NewKeyframe | None:
         around = [o for o in self._window if o is not look and abs(o.travelled_m - look.travelled_m) <= REACH_M]
-        others = around[:: max(1, -(-len(around) // 12))]  # a dozen are enough
+        others = around[:: max(1, -(-len(around) // 12))]  # at most a dozen
         points = triangulate(self._camera, self._view(look), [self._view(other) for other in others])
         kept = _spread(points, look.features.px[points.feature], (self._camera.width_px, self._camera.height_px))
         if len(kept) < MIN_POINTS:
@@ -141,11 +141,11 @@ class KeyframeBuilder:
 
 
 def _spread(points: Points, px: Floats, size_px: tuple[int, int]) -> Ints:
-    """At most MAX_POINTS rows: in turn the best of each cell of the image, by frames that saw it and depth."""
+    """Returns at most MAX_POINTS rows, best first and evenly over the cells of the image."""
     cells = np.floor(px / size_px * GRID_CELLS).astype(int) @ (1, GRID_CELLS[0])
     quality = np.minimum(points.frames, 8) - 20.0 * points.sigma_depth_rel - points.p_cam_m[:, 2] / 30.0
     order = np.lexsort((-quality, cells))
-    rank = np.zeros(len(order), np.int64)  # of each point in its cell
+    rank = np.zeros(len(order), np.int64)  # of each point within its cell
     for cell in np.unique(cells):
         mine = order[cells[order] == cell]
         rank[mine] = np.arange(len(mine))

@@ -1,8 +1,8 @@
-"""Where the ego is in a map, frame by frame: recognised, confirmed, followed, lost.
+"""Localises the ego in a map frame by frame: recognition, confirmation, tracking, loss.
 
-A place is believed once two further frames, looked at where odometry says that they are, confirm it. From then on each
-frame's fix corrects what odometry foresees, in a Kalman filter of the map's motion against odometry; fixes of one map
-share its errors, so those are added to what is reported and not averaged away (a consider state, Schmidt 1966).
+A recognised place must be confirmed by two further frames. Then a Kalman filter corrects odometry's prediction by each
+frame's fix. The errors of the map are common to all fixes; they are added to the reported covariance (a consider state,
+Schmidt 1966).
 """
 
 from __future__ import annotations
@@ -22,34 +22,32 @@ from birdslam.loops.place_map import PlaceMap
 from birdslam.loops.verification import Fix, locate
 from birdslam.types import Attitude, Estimate
 
-CANDIDATES = 6  # places that are verified by geometry in one frame
-RARE_M = 4.0  # of way, from one look-up among all places to the next, for who is on a way that the map does not know
-FOUND_INLIERS, FOUND_PLACES = 25, 7  # of a frame that nothing was known of
-FOUND_SHARE = 0.3  # of its matches that must fit
-KEPT_INLIERS, KEPT_PLACES = 18, 6  # of a frame that was foreseen
-ENOUGH_INLIERS = 40  # with fewer, farther keyframes are looked at too
-CONFIRMATIONS = 2  # further frames that must say the same
-KIDNAPPED_CONFIRMATIONS = 12  # where odometry since the last fix contradicts them: it was cut, or the place is another
-HYPOTHESES = 4
-HYPOTHESIS_M = 30.0  # after so much way without confirmation one is given up
-CHI2_GATE = 16.27  # of three degrees of freedom, 99.9 %
-FOLLOWED_M = 30.0  # of way since the last fix, along which the ego is looked for where odometry says
-FOLLOW_M = 12.0  # keyframes within it are looked for
+CANDIDATES = 6  # places verified geometrically per frame
+LOOK_UP_EVERY_M = 4.0  # interval of queries of the index on a road that is not in the map
+FOUND_INLIERS, FOUND_PLACES = 25, 7  # minimum for a frame without a prediction
+FOUND_RATIO = 0.3  # min. inlier ratio of its matches
+KEPT_INLIERS, KEPT_PLACES = 18, 6  # minimum for a frame with a prediction
+ENOUGH_INLIERS = 40  # with fewer inliers farther keyframes are matched too
+CONFIRMATIONS = 2  # required further frames
+KIDNAPPED_CONFIRMATIONS = 12  # if they contradict odometry since the last fix
+MAX_HYPOTHESES = 4
+HYPOTHESIS_M = 30.0  # max. distance travelled without a confirmation
+CHI2_GATE = 16.27  # three degrees of freedom, 99.9 %
+FOLLOWED_M = 30.0  # max. distance travelled since the last fix for tracking
+FOLLOW_M = 12.0  # max. distance of matched keyframes
 SEARCH_PX, MAX_SEARCH_PX = 25.0, 120.0
 MAX_DISTANCE_M, MIN_STEP_M = 1e5, 0.1
-# What fixes by one keyframe share, by how far the ego is from it along its axis and aside: its points were seen along
-# the way only, and what their depths have in common shows from aside. That the car tilts is no such error (foot.py),
-# nor that all metres of the map are too long
+# Common error of fixes by one keyframe, per metre of distance along its axis and across: its points were triangulated
+# along its axis, so that their common depth error appears from the side
 ALONG_REL, ASIDE_REL = 0.006, 0.02
 SHARED_YAW_RAD, ASIDE_YAW_RAD_PER_M = 0.0003, 0.0007
-SAME_POINTS_M = 2.0  # of way, along which fixes see the same points: all of them together tell as much as one
-# Of the way since the last fix where a frame was looked for and not found: an odometry that is right would have been
-MISSED_REL = 0.1
+SAME_POINTS_M = 2.0  # distance travelled within which fixes see the same points and count as one
+MISSED_REL = 0.1  # 1-sigma of the distance since the last fix, if a predicted frame did not match the map
 
 
 @dataclass(frozen=True, eq=False)
 class Localisation:
-    """Of one frame."""
+    """The localisation of one frame."""
 
     frame_id: int
     t_source_ns: int
@@ -57,23 +55,23 @@ class Localisation:
     T_map_ego: SE2 | None  # None: lost
     cov: Floats  # (3, 3) of the tangent at the pose; infinite where lost
     attitude: Attitude  # of the ego in the map's frame, by the last fix
-    inliers: int = 0  # of this frame's own fix; 0: carried by odometry
-    map_epoch: int = 0  # raised where T_map_odom jumped
+    inliers: int = 0  # of this frame's fix; 0: predicted by odometry
+    map_epoch: int = 0  # increased when T_map_odom jumps
 
 
 @dataclass(eq=False)
 class _Hypothesis:
-    """A place that the ego may be at, still to be confirmed."""
+    """An unconfirmed pose of the ego."""
 
     T_map_odom: SE2
     cov: Floats
     travelled_m: float
     confirmed: int = 0
-    kidnapped: bool = False  # it contradicts what odometry says since the last fix
+    kidnapped: bool = False  # contradicts odometry since the last fix
 
 
 class Localiser:
-    """In one map; poses in odometry come with each frame."""
+    """Localises frames with odometry in one map."""
 
     def __init__(self, camera: Camera, place_map: PlaceMap) -> None:
         self._camera = camera
@@ -84,28 +82,28 @@ class Localiser:
         self.travelled_m = 0.0
         self._T_odom_ego: SE2 | None = None
         self.steps = Steps()
-        self._scale_rel = 0.0  # 1-sigma of odometry's metres, by its own word
+        self._scale_rel = 0.0  # odometry's 1-sigma of its scale
         self._T_map_ego: SE2 | None = None
         self._cov: Floats = np.zeros((3, 3))
         self._shared: Floats = np.zeros((3, 3))
         self._hypotheses: list[_Hypothesis] = []
         self.since_fix_m = math.inf
-        self._missed = False  # since the last fix a frame was looked for in the map, and not found
-        self.own_way_m: dict[int, float] = {}  # rows of keyframes that this very drive made: the way at each
+        self._missed = False  # whether a frame since the last fix did not match the map
+        self.own_way_m: dict[int, float] = {}  # rows of this drive's keyframes -> distance travelled
         self.was_kidnapped = False  # the newest fix contradicted odometry
-        self._looked_up_m = -math.inf  # the way at which a place was last looked up among all of the map
+        self._looked_up_m = -math.inf  # distance travelled at the last query of the index
 
     @property
     def T_map_odom(self) -> SE2 | None:
-        """Joins the two frames (REP-105); None where lost."""
+        """The transform between the frames of REP-105; None when lost."""
         if self._T_map_ego is None or self._T_odom_ego is None:
             return None
         return self._T_map_ego @ self._T_odom_ego.inverse()
 
     @property
     def cov(self) -> Floats:
-        """(3, 3) of the pose in the map, with what fixes share."""
-        scale_rel = max(MISSED_REL if self._missed else MIN_SCALE_REL, self._scale_rel)  # all along the way
+        """Covariance (3, 3) of the pose in the map, including the common errors of fixes."""
+        scale_rel = max(MISSED_REL if self._missed else MIN_SCALE_REL, self._scale_rel)
         scale_m = scale_rel * min(self.since_fix_m, MAX_DISTANCE_M)
         return self._cov + self._shared + np.diag([scale_m**2, scale_m**2, 0.0])
 
@@ -117,12 +115,12 @@ class Localiser:
         return MapState.LOCALISED if exact else MapState.ODOMETRY_ONLY
 
     def place(self, T_map_ego: SE2, T_odom_ego: SE2, cov: Floats, since_fix_m: float = math.inf) -> None:
-        """Begins at a known pose: of a new map its origin, or where another process had come to."""
+        """Sets a known pose: the origin of a new map, or the last pose of another process."""
         self._T_map_ego, self._T_odom_ego, self._cov = T_map_ego, T_odom_ego, cov
         self.since_fix_m = since_fix_m
 
     def shift(self, T_new_old: SE2) -> None:
-        """The map was optimised: what lay at T lies at T_new_old @ T now."""
+        """Applies a correction of the map: a pose T becomes T_new_old @ T."""
         if self._T_map_ego is not None:
             self._T_map_ego = T_new_old @ self._T_map_ego
         for hypothesis in self._hypotheses:
@@ -130,14 +128,14 @@ class Localiser:
         self.map_epoch += 1
 
     def lose(self) -> None:
-        """Odometry restarted: nothing is known any more."""
+        """Resets the localiser after a restart of odometry."""
         self._T_map_ego, self._T_odom_ego = None, None
         self.steps = Steps()
         self._hypotheses.clear()
         self.since_fix_m = math.inf
 
     def move(self, estimate: Estimate) -> None:
-        """By odometry, as sure as it says that it is."""
+        """Predicts the pose by odometry, with its reported uncertainty."""
         T_odom_ego, scale_rel = estimate.T_world_ego, estimate.scale_sigma_rel
         error_m, self._scale_rel = self.steps.add(estimate), scale_rel
         if self._T_odom_ego is not None:
@@ -153,10 +151,7 @@ class Localiser:
         self._T_odom_ego = T_odom_ego
 
     def look(self, features: Features, among: Bools | None = None) -> bool:
-        """Corrects the pose by a frame at the pose that it has moved to; `among`: keyframes that may be used.
-
-        Says whether a fix came of it.
-        """
+        """Corrects the predicted pose by a frame; `among`: allowed keyframes. Returns whether there was a fix."""
         self.fix = None
         if self._T_odom_ego is None or not len(self.map):
             return False
@@ -171,7 +166,7 @@ class Localiser:
         return self._recognise(features, among, fix)
 
     def _follow(self, features: Features, guess: SE2, cov: Floats, among: Bools | None) -> Fix | None:
-        """A fix where the ego is thought to be, if it is one by inliers and by chi-square."""
+        """Returns a fix near the predicted pose if it passes the tests of inliers and chi-square."""
         rows = self.map.near(guess, FOLLOW_M, among)
         if not rows:
             return None
@@ -203,10 +198,10 @@ class Localiser:
         self.fix, self.since_fix_m, self._missed = fix, 0.0, False
 
     def _recognise(self, features: Features, among: Bools | None, foreseen: Fix | None) -> bool:
-        """Confirms hypotheses, or makes new ones of places that look alike.
+        """Confirms hypotheses, or creates new ones by place recognition.
 
-        `foreseen` is where odometry says: who is not localised any more has to find as much as who was lost, since a
-        fix from a wrong guess may be a wrong one.
+        `foreseen`: the fix near odometry's prediction. When not localised it must pass the same tests as without a
+        prediction, since a wrong prediction may lead to a wrong fix.
         """
         assert self._T_odom_ego is not None
         self._hypotheses = [h for h in self._hypotheses if self.travelled_m - h.travelled_m < HYPOTHESIS_M]
@@ -220,14 +215,14 @@ class Localiser:
             hypothesis.cov = fix.cov + shared(fix)
             if hypothesis.confirmed >= enough:
                 self.was_kidnapped = hypothesis.kidnapped
-                self._believe(fix)
+                self._accept(fix)
                 return True
             return False
         if foreseen is not None and is_place(foreseen):
-            self._suppose(foreseen, kidnapped=False)
+            self._add_hypothesis(foreseen, kidnapped=False)
             return False
-        unknown = self._T_map_ego is not None and not self._missed  # a street that the map lacks, as of a new map all
-        if unknown and self.travelled_m - self._looked_up_m < RARE_M:
+        unknown = self._T_map_ego is not None and not self._missed  # not in the map, as all of a new map
+        if unknown and self.travelled_m - self._looked_up_m < LOOK_UP_EVERY_M:
             return False
         self._looked_up_m = self.travelled_m
         for row in self.map.index().look_up(features.descriptors, CANDIDATES, among):
@@ -235,20 +230,20 @@ class Localiser:
             if found is None or not is_place(found):
                 continue
             kidnapped = self._contradicts(found, row)
-            if kidnapped and row in self.own_way_m:  # a street that looks like an earlier one
+            if kidnapped and row in self.own_way_m:  # a similar street of the same drive
                 continue
-            self._suppose(found, kidnapped)
+            self._add_hypothesis(found, kidnapped)
             break
         return False
 
-    def _suppose(self, fix: Fix, kidnapped: bool) -> None:
+    def _add_hypothesis(self, fix: Fix, kidnapped: bool) -> None:
         assert self._T_odom_ego is not None
         T_map_odom, cov = fix.T_map_ego @ self._T_odom_ego.inverse(), fix.cov + shared(fix)
         new = _Hypothesis(T_map_odom, cov, self.travelled_m, kidnapped=kidnapped)
-        self._hypotheses = [*self._hypotheses, new][-HYPOTHESES:]
+        self._hypotheses = [*self._hypotheses, new][-MAX_HYPOTHESES:]
 
     def _contradicts(self, fix: Fix, row: int) -> bool:
-        """Chi-square against the drift: since the drive passed there itself, or since the last fix."""
+        """Tests a fix by chi-square against the drift since the drive's own keyframe, or since the last fix."""
         if self._T_map_ego is None:
             return False
         way_m = self.travelled_m - self.own_way_m[row] if row in self.own_way_m else self.since_fix_m
@@ -257,7 +252,7 @@ class Localiser:
         error = self._T_map_ego.between(fix.T_map_ego).log()
         return float(error @ np.linalg.solve(drift_after(way_m) + fix.cov, error)) > CHI2_GATE
 
-    def _believe(self, fix: Fix) -> None:
+    def _accept(self, fix: Fix) -> None:
         self._T_map_ego, self._cov = fix.T_map_ego, fix.cov
         self._shared = shared(fix)
         self.attitude = fix.attitude_in_map(self._camera)
@@ -267,12 +262,12 @@ class Localiser:
 
 
 def is_place(fix: Fix) -> bool:
-    """Whether a frame of which nothing was known may be where the fix says."""
-    return fix.inliers >= FOUND_INLIERS and fix.places >= FOUND_PLACES and fix.inliers >= FOUND_SHARE * fix.matches
+    """Whether a fix without a prediction is plausible."""
+    return fix.inliers >= FOUND_INLIERS and fix.places >= FOUND_PLACES and fix.inliers >= FOUND_RATIO * fix.matches
 
 
 def shared(fix: Fix) -> Floats:
-    """(3, 3) covariance of what further fixes here will be wrong by as well."""
+    """Returns the covariance (3, 3) of the error common to all fixes here."""
     x_m, y_m = fix.T_keyframe_ego.x_m, fix.T_keyframe_ego.y_m
     variance_m2 = (ALONG_REL * x_m) ** 2 + (ASIDE_REL * y_m) ** 2
     return np.diag([variance_m2, variance_m2, SHARED_YAW_RAD**2 + (ASIDE_YAW_RAD_PER_M * y_m) ** 2])

@@ -1,8 +1,7 @@
-"""A map as bytes: a mark, the version, the length and the CRC-32 of what follows, and MessagePack.
+"""Encodes a map: magic, version, length and CRC-32 of the body, and the body as MessagePack.
 
-Points and lines are rounded to a centimetre and depths' sigmas to 4 %; descriptors are as they are. No images. A file
-of version 2 has no lines, one of 3 no scales: both are read; one of another version is refused, not guessed at.
-Whatever the bytes, `decode_map` gives a whole map or raises MapError.
+Points and lines are rounded to 1 cm and depth sigmas to 4 %; no images. Versions 2 (no lines) and 3 (no scales) are
+readable, others are rejected. `decode_map` returns a complete map or raises MapError.
 """
 
 from __future__ import annotations
@@ -28,10 +27,10 @@ MAGIC = b"BirdSLAM map\n"
 HEAD = struct.Struct("<HQI")  # version, bytes, CRC-32
 MAX_BYTES = 1 << 31  # 1,000 km
 MAX_KEYFRAMES, MAX_KEYFRAME_POINTS = 1_000_000, 2048
-MAX_PIECES, MAX_NODES = 64, 64  # of a keyframe's lines, and of each
+MAX_PIECES, MAX_NODES = 64, 64  # lines of a keyframe, points of a line
 MIN_SCALE, MAX_SCALE_REL = 0.1, 10.0
-POINT_M = 0.01  # what a point's coordinate is rounded to, in 16 bits
-SIGMA_STEP = 0.04  # of the logarithm of a sigma, from MIN_SIGMA on, in 8 bits
+POINT_M = 0.01  # resolution of a coordinate, in 16 bits
+SIGMA_STEP = 0.04  # resolution of a log sigma, from MIN_SIGMA on, in 8 bits
 MIN_SIGMA = 1e-4
 _POINT_BYTES = 6 + 1 + DESCRIPTOR_BYTES
 
@@ -81,7 +80,7 @@ class LinkRecord(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fi
 
 
 class EarthRecord(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """Where the map is on Earth."""
+    """The georeference of a map."""
 
     latitude_deg: float
     longitude_deg: float
@@ -97,7 +96,7 @@ class EarthRecord(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_f
 
 
 class MapRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """All of the file behind its head."""
+    """The body of the file."""
 
     camera: MapCamera
     drives: _Number
@@ -108,7 +107,7 @@ class MapRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def encode_map(place_map: PlaceMap) -> bytes:
-    """The bytes of a map's file."""
+    """Encodes a map."""
     words = b"" if place_map.words is None else place_map.words.tobytes()
     record = MapRecord(
         place_map.camera,
@@ -126,52 +125,52 @@ def encode_map(place_map: PlaceMap) -> bytes:
 
 
 def decode_map(data: bytes) -> PlaceMap:
-    """The map of these bytes. Raises MapError."""
+    """Decodes a map. Raises MapError."""
     if not data:
         raise MapError("is empty")
     head = len(MAGIC) + HEAD.size
     if data[: len(MAGIC)] != MAGIC:
         raise MapError("is no map of BirdSLAM")
     if len(data) < head:
-        raise MapError("is cut off in its head")
+        raise MapError("is truncated in its header")
     version, length, crc = HEAD.unpack(data[len(MAGIC) : head])
     if version not in READ:
         reads = " and ".join(map(str, READ))
-        raise MapError(f"is of version {version}, and this BirdSLAM reads versions {reads}: drive it again")
+        raise MapError(f"is of version {version}; this BirdSLAM reads versions {reads}; create it again")
     if length > MAX_BYTES:
         raise MapError(f"declares {length} bytes, more than the limit of {MAX_BYTES}")
     if len(data) - head != length:
-        raise MapError(f"is torn: it has {len(data) - head} bytes behind its head in place of {length}")
+        raise MapError(f"is truncated: it has {len(data) - head} bytes after its header instead of {length}")
     body = data[head:]
     if zlib.crc32(body) != crc:
         raise MapError("is damaged: its CRC-32 differs")
     try:
         record = msgspec.msgpack.decode(body, type=MapRecord)
     except (msgspec.DecodeError, ValueError, RecursionError) as error:
-        raise MapError(f"holds something that is no map: {error}") from None
+        raise MapError(f"has an invalid body: {error}") from None
     return _map_of(record)
 
 
 def _map_of(record: MapRecord) -> PlaceMap:
     camera = record.camera
     if not (math.isfinite(camera.fx_px) and camera.fx_px > 0.0 and 0.1 < camera.height_m < 10.0):
-        raise MapError("was made with numbers that are no camera's")
+        raise MapError("has an invalid camera")
     if not (0 < camera.width_px <= 1 << 16 and 0 < camera.height_px <= 1 << 16):
-        raise MapError("was made with numbers that are no camera's")
+        raise MapError("has an invalid camera")
     if len(record.keyframes) > MAX_KEYFRAMES:
         raise MapError(f"has {len(record.keyframes)} keyframes: more than {MAX_KEYFRAMES}")
     if len(record.words) % DESCRIPTOR_BYTES or len(record.words) > DESCRIPTOR_BYTES * (1 << 16):
-        raise MapError("has words that are none")
+        raise MapError("has invalid words")
     keyframes = [_keyframe(each) for each in record.keyframes]
     numbers = {keyframe.number for keyframe in keyframes}
     if len(numbers) != len(keyframes):
-        raise MapError("has two keyframes of one number")
+        raise MapError("has two keyframes with the same number")
     links = []
     for link in record.links:
         if link.from_number not in numbers or link.to_number not in numbers:
-            raise MapError("links keyframes that it does not have")
+            raise MapError("has a link to a missing keyframe")
         if not 0.0 <= link.scale_rel <= MAX_SCALE_REL:
-            raise MapError("has a link whose scale is none")
+            raise MapError("has a link with an invalid scale")
         cov = _matrix(link.cov)
         links.append(Link(link.from_number, link.to_number, link.T_from_to, cov, link.loop, link.scale_rel))
     words = np.frombuffer(record.words, np.uint8).reshape(-1, DESCRIPTOR_BYTES) if record.words else None
@@ -187,12 +186,12 @@ def _earth_record(earth: Earth) -> EarthRecord:
 def _earth(record: EarthRecord) -> Earth:
     numbers = (record.east_m, record.north_m, record.yaw_rad, record.rms_m, record.late_m)
     if not (math.isfinite(sum(numbers)) and is_on_earth(record.latitude_deg, record.longitude_deg)):
-        raise MapError("its place on Earth is none")
+        raise MapError("has an invalid georeference")
     if not (0.5 < record.scale < 2.0 and max(map(abs, numbers)) < 1e7):
-        raise MapError("its place on Earth is none")
+        raise MapError("has an invalid georeference")
     cov = np.array(record.cov).reshape(4, 4)
     if not math.isfinite(sum(record.cov)) or np.linalg.eigvalsh(cov)[0] < -1e-9:
-        raise MapError("the covariance of its place on Earth is none")
+        raise MapError("has an invalid covariance of its georeference")
     return Earth(
         *(record.latitude_deg, record.longitude_deg, record.east_m, record.north_m, record.yaw_rad, record.scale, cov),
         *(0.0, record.fixes, record.outliers, record.rms_m, None, record.late_m),
@@ -227,7 +226,7 @@ def _piece_record(piece: LinePiece) -> PieceRecord:
 def _piece(record: PieceRecord) -> LinePiece:
     count, rest = divmod(len(record.points), 4)
     if rest or not 0 < count <= MAX_NODES or not 0.0 <= record.sigma_m < 1e3:
-        raise MapError(f"line {record.line}: its points are none")
+        raise MapError(f"line {record.line}: has invalid points")
     points_m = np.frombuffer(record.points, "<i2").reshape(-1, 2) * POINT_M
     return LinePiece(record.drive, record.line, record.kind, record.colour, points_m, record.sigma_m)
 
@@ -235,20 +234,20 @@ def _piece(record: PieceRecord) -> LinePiece:
 def _keyframe(record: KeyframeRecord) -> Keyframe:
     count, rest = divmod(len(record.points), _POINT_BYTES)
     if rest or count > MAX_KEYFRAME_POINTS:
-        raise MapError(f"keyframe {record.number}: its points are none")
+        raise MapError(f"keyframe {record.number}: has invalid points")
     if not math.isfinite(sum(record.attitude)) or max(map(abs, record.attitude[1:])) > 1.5:
-        raise MapError(f"keyframe {record.number}: its attitude is none")
+        raise MapError(f"keyframe {record.number}: has an invalid attitude")
     if not 0.1 < record.camera_height_m < 10.0:
-        raise MapError(f"keyframe {record.number}: its camera's height is none")
+        raise MapError(f"keyframe {record.number}: has an invalid camera height")
     if not MIN_SCALE < record.scale < 1.0 / MIN_SCALE:
-        raise MapError(f"keyframe {record.number}: its scale is none")
+        raise MapError(f"keyframe {record.number}: has an invalid scale")
     if len(record.lines) > MAX_PIECES:
         raise MapError(f"keyframe {record.number}: has {len(record.lines)} lines: more than {MAX_PIECES}")
     fixed = None if record.gnss is None else Fixed(*record.gnss)
     if fixed is not None and not (
         is_on_earth(fixed.latitude_deg, fixed.longitude_deg) and 0.0 < fixed.sigma_m <= fixed.weighed_m < 1e9
     ):
-        raise MapError(f"keyframe {record.number}: its place on Earth is none")
+        raise MapError(f"keyframe {record.number}: has an invalid GNSS fix")
     points = np.frombuffer(record.points, "<i2", 3 * count).reshape(-1, 3) * POINT_M
     sigmas = MIN_SIGMA * np.exp(SIGMA_STEP * np.frombuffer(record.points, np.uint8, count, 6 * count))
     descriptors = np.frombuffer(record.points, np.uint8, DESCRIPTOR_BYTES * count, 7 * count)

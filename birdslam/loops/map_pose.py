@@ -1,7 +1,7 @@
-"""Where odometry's frame lies in a map, as the map process says it: REP-105's odom and map frames.
+"""The pose of odometry's frame in the map frame, published by the map process (REP-105).
 
-Odometry's frame (`world` in an estimate) never jumps and drifts; the map's does not drift and may jump. `T_map_odom`
-joins them, and the ego in the map is `T_map_odom @ T_world_ego`, with the newest estimate as well as with older ones.
+Odometry's frame (`world` of an estimate) drifts but does not jump; the map frame does not drift but may jump. The ego
+in the map is `T_map_odom @ T_world_ego`, for the newest estimate and older ones.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from birdslam.types import NS_PER_S, Cov2, Cov3, Estimate, Word
 
 
 class MapState(Word):
-    """What a pose in the map rests on."""
+    """The state of the localisation in the map."""
 
-    LOCALISED = "localised"  # on the map: the pose is within its covariance
-    ODOMETRY_ONLY = "odometry_only"  # on odometry since the last fix, or since the beginning of a new map
-    LOST = "lost"  # there is no pose
+    LOCALISED = "localised"  # localised in the map
+    ODOMETRY_ONLY = "odometry_only"  # predicted by odometry since the last fix, or since the start of a new map
+    LOST = "lost"  # no pose
 
     NEWER = LOST
 
@@ -38,46 +38,46 @@ class EarthPose(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MapPose(msgspec.Struct, frozen=True, kw_only=True):
-    """The map process -> planners: odometry's frame in the map (REP-105), by one frame.
+    """The map process -> planners: odometry's frame in the map frame (REP-105), for one frame.
 
-    `frame_id`, the times and `epoch` are those of the estimate that it is of.
+    `frame_id`, the times and `epoch` are those of its estimate.
     """
 
     frame_id: int
     t_source_ns: int
     t_capture_ns: int
     t_utc_ns: int
-    epoch: int  # of the estimates that T_map_odom takes into the map
+    epoch: int  # of the estimates for which T_map_odom holds
     state: MapState
-    map_epoch: int = 0  # rises where T_map_odom jumped: a place was recognised again, or a loop was closed
-    T_map_odom: SE2 | None = None  # none where lost
+    map_epoch: int = 0  # increases when T_map_odom jumps, by a relocalisation or a loop closure
+    T_map_odom: SE2 | None = None  # none when lost
     T_odom_ego: SE2 | None = None  # the estimate's T_world_ego, at which cov holds
-    cov: Cov3 | None = None  # of T_map_odom @ T_odom_ego, of the tangent at that pose; none where lost
-    inliers: int = 0  # points of the map that this frame's own fix rests on; 0: carried by odometry
-    keyframes: int = 0  # that the map has
-    earth: EarthPose | None = None  # none where the map is not on Earth
+    cov: Cov3 | None = None  # of T_map_odom @ T_odom_ego, of the tangent at that pose; none when lost
+    inliers: int = 0  # map points of this frame's fix; 0: predicted by odometry
+    keyframes: int = 0  # of the map
+    earth: EarthPose | None = None  # none if the map is not georeferenced
 
 
 @dataclass(frozen=True, eq=False)
 class InMap:
-    """An estimate in the map."""
+    """An estimate in the map frame."""
 
     state: MapState
-    T_map_ego: SE2 | None  # none where lost
-    cov: Floats  # (3, 3) of the tangent at the pose, with odometry's drift since `pose`; infinite where lost
+    T_map_ego: SE2 | None  # none when lost
+    cov: Floats  # (3, 3) of the tangent at the pose, with odometry's drift since `pose`; infinite when lost
     map_epoch: int
-    pose: MapPose | None  # by which it was brought there; none: the map process never said one
+    pose: MapPose | None  # its source; none: no pose was published
 
 
-STALE_NS = NS_PER_S  # an older pose may be followed by unknown motion
+STALE_NS = NS_PER_S  # max. age of a pose
 
 NOWHERE = InMap(MapState.LOST, None, np.full((3, 3), np.inf), 0, None)
 
 
 def in_map(pose: MapPose | None, estimate: Estimate) -> InMap:
-    """The ego of an estimate in the map, by the newest pose that is known; lost where that is of another epoch.
+    """Converts an estimate to the map frame by the newest pose; lost if that is of another epoch.
 
-    Only `odometry_only` where the estimate is not valid, or over a second newer than the pose.
+    At most `odometry_only` if the estimate is invalid, or more than STALE_NS newer than the pose.
     """
     if pose is None:
         return NOWHERE

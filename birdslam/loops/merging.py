@@ -1,4 +1,4 @@
-"""Two maps of the same streets as one, and parts of a map."""
+"""Merges two maps that share streets, and extracts parts of a map."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.closing import close_loops, held
 from birdslam.loops.features import Features
-from birdslam.loops.gnss.factors import tie
+from birdslam.loops.gnss.factors import georeference
 from birdslam.loops.keyframe import Keyframe, Link
 from birdslam.loops.localiser import is_place, shared
 from birdslam.loops.place_map import PlaceMap
 from birdslam.loops.verification import Fix, locate
 
 CANDIDATES = 4
-MIN_MEETINGS = 3  # keyframes that must agree on how the maps lie to each other
+MIN_MEETINGS = 3  # keyframes that must agree on the transform between the maps
 AGREE_M, AGREE_RAD = 3.0, math.radians(4.0)
 POINT_SIGMA_PX = 1.0
 
@@ -29,12 +29,12 @@ class MergeError(ValueError):
 
 
 def merged(first: PlaceMap, second: PlaceMap) -> tuple[PlaceMap, int]:
-    """One map in the frame of `first`, and how many keyframes of `second` were found in it. Raises MergeError."""
+    """Returns the merged map in the frame of `first`, and the number of matched keyframes. Raises MergeError."""
     meetings = [(own, fix) for own in second.keyframes for fix in [_found(own, first)] if fix is not None]
     agreeing = _agreeing(meetings)
     if len(agreeing) < MIN_MEETINGS:
         raise MergeError(
-            f"the maps share no street that was recognised: {len(agreeing)} of {len(second)} keyframes agree, "
+            f"the maps have no recognised street in common: {len(agreeing)} of {len(second)} keyframes agree, "
             f"{MIN_MEETINGS} are needed"
         )
     number = {keyframe.number: first.next_number + row for row, keyframe in enumerate(second.keyframes)}
@@ -58,12 +58,12 @@ def merged(first: PlaceMap, second: PlaceMap) -> tuple[PlaceMap, int]:
     if out.earth is None and second.earth is not None:
         out.earth = second.earth.seen_from(T_first_second)
     if out.earth is not None:
-        out.come_to_earth(tie(out.earth, out.keyframes, out.links, out.fixed()))
+        out.georeference(georeference(out.earth, out.keyframes, out.links, out.fixed()))
     return out, len(agreeing)
 
 
 def part(place_map: PlaceMap, keeps: Callable[[Keyframe], bool]) -> PlaceMap:
-    """The keyframes that `keeps` says yes to, with the links between them."""
+    """Returns the map of the keyframes selected by `keeps`, with the links between them."""
     keyframes = [keyframe for keyframe in place_map.keyframes if keeps(keyframe)]
     numbers = {keyframe.number for keyframe in keyframes}
     links = [link for link in place_map.links if {link.from_number, link.to_number} <= numbers]
@@ -73,7 +73,7 @@ def part(place_map: PlaceMap, keeps: Callable[[Keyframe], bool]) -> PlaceMap:
 
 
 def _camera(keyframe: Keyframe, other: PlaceMap) -> Camera:
-    """A camera that stood where the keyframe's did; its points are seen again without an image."""
+    """Returns a camera for the keyframe, to project its points without an image."""
     own = other.camera
     width_px, height_px = own.width_px, own.height_px
     return Camera(
@@ -100,7 +100,7 @@ def _found(own: Keyframe, other: PlaceMap) -> Fix | None:
 
 
 def _agreeing(meetings: list[tuple[Keyframe, Fix]]) -> list[tuple[Keyframe, Fix]]:
-    """The largest set of meetings that say the same of how the maps lie to each other."""
+    """Returns the largest set of meetings that agree on the transform between the maps."""
     between = [fix.T_map_ego @ own.T_map_keyframe.inverse() for own, fix in meetings]
     best: list[int] = []
     for here, T in zip(meetings, between, strict=True):

@@ -1,8 +1,8 @@
-"""Which keyframes look like a frame: each of its corners votes for the keyframe with the descriptor nearest to it.
+"""Place recognition: each corner of a frame votes for the keyframe with the nearest descriptor.
 
-The nearest is looked for by an inverted file (Sivic and Zisserman 2003) of faiss: descriptors lie in the lists of their
-nearest words, and those in a few lists are compared bit by bit (Hamming embedding, Jegou et al. 2008). The words are
-learned from the map's own descriptors by k-majority and kept in its file, so that nothing has to ship.
+Nearest neighbours come from an inverted file (Sivic and Zisserman 2003) of faiss: descriptors are in the lists of their
+nearest words; those of a few lists are compared by Hamming distance (Jegou et al. 2008). The words are learned from the
+map's descriptors by k-majority and stored in its file.
 """
 
 from __future__ import annotations
@@ -17,33 +17,33 @@ from birdslam.geometry.arrays import Bools, Floats32
 from birdslam.loops.features import DESCRIPTOR_BYTES
 from birdslam.loops.verification import MATCH_BITS
 
-# How many words: in a list lie as many descriptors as there are lists, within a factor; faiss advises 4 to 16
+# Number of words as a multiple of the square root of the number of descriptors; faiss recommends 4 to 16
 WORDS_PER_ROOT, MIN_WORDS, MAX_WORDS = 4.0, 16, 2048
-LEARNED_FROM = 20_000  # descriptors at the most
+MAX_TRAINING = 20_000  # descriptors
 ROUNDS = 5
-AT_A_TIME = 1024  # descriptors, so that a map process does not grow by it
-PROBES = 8  # lists that are looked into
+BATCH = 1024  # descriptors, to limit memory
+PROBES = 8  # searched lists
 _SEED = 39
 
 
 def words_for(descriptors: int) -> int:
-    """How many words an index of so many descriptors has."""
+    """Returns the number of words for a number of descriptors."""
     return int(np.clip(WORDS_PER_ROOT * descriptors**0.5, min(MIN_WORDS, descriptors), MAX_WORDS))
 
 
 def learn_words(descriptors: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(K, 32) words of descriptors (N, 32), by k-majority from a seeded start: the same each time."""
+    """Learns words (K, 32) of descriptors (N, 32) by k-majority; deterministic."""
     random = np.random.default_rng(_SEED)
     count = words_for(len(descriptors))
-    if len(descriptors) > LEARNED_FROM:
-        descriptors = descriptors[np.sort(random.choice(len(descriptors), LEARNED_FROM, replace=False))]
+    if len(descriptors) > MAX_TRAINING:
+        descriptors = descriptors[np.sort(random.choice(len(descriptors), MAX_TRAINING, replace=False))]
     if not count:
         return np.zeros((0, DESCRIPTOR_BYTES), np.uint8)
     words = _signs(descriptors[random.choice(len(descriptors), count, replace=False)])
     for _ in range(ROUNDS):
         sums, present = np.zeros_like(words), np.zeros(count, bool)
-        for begin in range(0, len(descriptors), AT_A_TIME):
-            signs = _signs(descriptors[begin : begin + AT_A_TIME])
+        for begin in range(0, len(descriptors), BATCH):
+            signs = _signs(descriptors[begin : begin + BATCH])
             nearest = (signs @ words.T).argmax(axis=1)
             order = np.argsort(nearest, kind="stable")
             numbers, first = np.unique(nearest[order], return_index=True)
@@ -58,27 +58,27 @@ def _signs(descriptors: NDArray[np.uint8]) -> Floats32:
 
 
 class PlaceIndex:
-    """Of keyframes, each given by its descriptors; grows by `add`."""
+    """An index of keyframes by their descriptors."""
 
     def __init__(self, words: NDArray[np.uint8]) -> None:
         self.words = words
-        self._lists: Any = None  # faiss's, of words: its file of descriptors does not keep them alive itself
+        self._lists: Any = None  # faiss's quantizer, referenced here since the inverted file does not own it
         self._file: Any = None
         self._filed = 0  # keyframes in it
-        self._waiting: list[NDArray[np.uint8]] = []  # those after them
+        self._waiting: list[NDArray[np.uint8]] = []  # later keyframes
 
     def __len__(self) -> int:
         return self._filed + len(self._waiting)
 
     def add(self, descriptors: NDArray[np.uint8]) -> None:
-        """The next keyframe."""
+        """Adds the next keyframe."""
         self._waiting.append(descriptors)
 
     def look_up(self, descriptors: NDArray[np.uint8], most: int, among: Bools | None = None) -> list[int]:
-        """The numbers of the `most` keyframes most like these descriptors, the best first.
+        """Returns the rows of the `most` keyframes most similar to the descriptors, best first.
 
-        `among` (N,): only those. The last ones, which a drive has just made, are filed once they are among them: else
-        each corner would vote for the keyframe before it.
+        `among` (N,): allowed keyframes. The latest ones of a drive are indexed only when allowed; otherwise all corners
+        would vote for the previous keyframe.
         """
         if not len(descriptors) or not len(self.words):
             return []
@@ -93,7 +93,7 @@ class PlaceIndex:
         return [int(row) for row in order if votes[row]]
 
     def _put_in_file(self, until: int) -> None:
-        """The keyframes that wait, before this one."""
+        """Indexes the waiting keyframes before `until`."""
         new = self._waiting[: max(until - self._filed, 0)]
         if not new:
             return
@@ -106,20 +106,20 @@ class PlaceIndex:
 
 
 def _empty_file(words: NDArray[np.uint8]) -> tuple[Any, Any]:
-    import faiss  # here: only who looks places up needs it
+    import faiss
 
-    faiss.omp_set_num_threads(1)  # the other cores are the frames'
+    faiss.omp_set_num_threads(1)  # leave the other cores to the pipeline
     bits = 8 * DESCRIPTOR_BYTES
     lists = faiss.IndexBinaryFlat(bits)
     lists.add(np.ascontiguousarray(words))
     file = faiss.IndexBinaryIVF(lists, bits, len(words))
-    file.train(np.ascontiguousarray(words))  # it is: by its words
+    file.train(np.ascontiguousarray(words))  # already trained by the words
     file.nprobe = PROBES
     return lists, file
 
 
 def index_of(descriptors: Sequence[NDArray[np.uint8]], words: NDArray[np.uint8]) -> PlaceIndex:
-    """An index of keyframes."""
+    """Returns an index of keyframes."""
     index = PlaceIndex(words)
     for each in descriptors:
         index.add(each)

@@ -1,4 +1,4 @@
-"""A map: keyframes, the links between them, and the index by which they are found."""
+"""A map: keyframes, their links, and the index for place recognition."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from birdslam.loops.place_index import PlaceIndex, index_of, learn_words, words_
 from birdslam.loops.verification import LocalMap
 from birdslam.types import LineColour, LineKind
 
-NEIGHBOUR_M, NEIGHBOURS = 9.0, 3  # keyframes this near help each other
-FAR_NEIGHBOUR_M, FAR_NEIGHBOURS = 17.0, 7  # and these where that is too little
+NEIGHBOUR_M, NEIGHBOURS = 9.0, 3  # keyframes that are matched together
+FAR_NEIGHBOUR_M, FAR_NEIGHBOURS = 17.0, 7  # with too few inliers
 MAX_GAP_M = 8.0  # between two pieces of one line
-EARTH_REACH_M = 100.0  # a place on Earth is that of the keyframes around it
+EARTH_REACH_M = 100.0  # max. distance of a keyframe for the ego's pose on Earth
 SAME_HEADING_RAD = math.radians(60.0)
-OTHER_HEIGHT, OTHER_FOCAL_LENGTH = 0.1, 0.1  # logarithms of ratios
+MAX_HEIGHT_RATIO, MAX_FOCAL_RATIO = 0.1, 0.1  # logarithms
 
 
 class MapCamera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -39,20 +39,20 @@ class MapCamera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     width_px: int
     height_px: int
     fx_px: float
-    height_m: float  # over the road: the map's metres
+    height_m: float  # over the road, which sets the map's scale
 
     @staticmethod
     def of(camera: Camera) -> MapCamera:
-        """As a map keeps it."""
+        """Returns the record of a camera."""
         digest = hashlib.sha256(msgspec.json.encode(camera)).hexdigest()[:16]
         return MapCamera(digest, camera.width_px, camera.height_px, camera.fx_px, camera.height_m)
 
     def differs(self, camera: Camera) -> str:
-        """How another camera is another one: in what a corner looks like, or in metres; "" where it is not."""
-        if abs(math.log(self.height_m / camera.height_m)) > OTHER_HEIGHT:
+        """Returns how another camera differs in height or focal length; "" if it does not."""
+        if abs(math.log(self.height_m / camera.height_m)) > MAX_HEIGHT_RATIO:
             return f"its height is {camera.height_m:g} m, that of the map's camera {self.height_m:g} m"
         per_px = self.fx_px / self.width_px / (camera.fx_px / camera.width_px)
-        if abs(math.log(per_px)) > OTHER_FOCAL_LENGTH:
+        if abs(math.log(per_px)) > MAX_FOCAL_RATIO:
             return (
                 f"its focal length is {camera.fx_px:g} px of {camera.width_px}, "
                 f"the map's was {self.fx_px:g} px of {self.width_px}"
@@ -62,7 +62,7 @@ class MapCamera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True, eq=False)
 class MapLine:
-    """A line of the road in the map."""
+    """A lane line in the map."""
 
     drive: int
     line: int  # its number in that drive
@@ -73,7 +73,7 @@ class MapLine:
 
 
 class PlaceMap:
-    """Keyframes by their number, in the map's frame."""
+    """A map: keyframes in the map frame, links, and an index."""
 
     def __init__(
         self,
@@ -87,8 +87,8 @@ class PlaceMap:
         self.camera = camera
         self.keyframes: list[Keyframe] = list(keyframes)
         self.links: list[Link] = list(links)
-        self.drives = drives  # that it was made of
-        self.earth = earth  # where it is on Earth; None: no fixes yet
+        self.drives = drives  # number of drives
+        self.earth = earth  # georeference; None: no fixes yet
         self.words = words
         self._descriptors = sum(len(keyframe.descriptors) for keyframe in self.keyframes)
         self._index: PlaceIndex | None = None
@@ -103,11 +103,11 @@ class PlaceMap:
 
     @property
     def length_m(self) -> float:
-        """Of the drives' way between keyframes."""
+        """Length of all drives."""
         return float(sum(math.hypot(link.T_from_to.x_m, link.T_from_to.y_m) for link in self.links if not link.loop))
 
     def add(self, keyframe: Keyframe) -> None:
-        """A further keyframe; it can be found soon. Words are learned again whenever the map wants twice as many."""
+        """Adds a keyframe; the words are learned again when the map needs twice as many."""
         self.keyframes.append(keyframe)
         self._descriptors += len(keyframe.descriptors)
         if self.words is not None and words_for(self._descriptors) >= 2 * len(self.words):
@@ -116,7 +116,7 @@ class PlaceMap:
             self._index.add(keyframe.descriptors)
 
     def place(self, poses: Mapping[int, Solved]) -> None:
-        """Moves keyframes, by number, to where the graph has them."""
+        """Moves keyframes to their poses in the solved graph."""
         self.keyframes = [
             keyframe.at(*poses[keyframe.number]) if keyframe.number in poses else keyframe
             for keyframe in self.keyframes
@@ -124,17 +124,20 @@ class PlaceMap:
         self._poses = np.zeros((0, 3))
 
     def fixed(self) -> dict[int, Fixed]:
-        """The fixes of its keyframes, by number."""
+        """Returns the fixes of the keyframes, by number."""
         return {keyframe.number: keyframe.gnss for keyframe in self.keyframes if keyframe.gnss is not None}
 
-    def come_to_earth(self, found: OnEarth) -> None:
-        """Its keyframes lie where fixes put them."""
+    def georeference(self, found: OnEarth) -> None:
+        """Applies the result of `gnss.factors.georeference`."""
         self.place(found.poses)
         self.keyframes = [replace(each, gnss=found.fixed.get(each.number)) for each in self.keyframes]
         self.earth = found.earth
 
     def on_earth(self, T_map_ego: SE2, cov: Floats) -> EarthPose | None:
-        """An ego with its covariance (3, 3) of the tangent; None: the map is not on Earth, or not where the ego is."""
+        """Returns the ego's pose on Earth, given its covariance (3, 3) of the tangent.
+
+        None if the map is not georeferenced or has no keyframe near the ego.
+        """
         rows = self.near(T_map_ego, EARTH_REACH_M)
         if self.earth is None or not rows:
             return None
@@ -143,7 +146,7 @@ class PlaceMap:
         return self.earth.pose(T_map_ego, cov + Ad @ nearest.cov @ Ad.T)
 
     def index(self) -> PlaceIndex:
-        """Made when it is first asked for."""
+        """Returns the index; built at the first call."""
         if self._index is None:
             if self.words is None or not len(self.words):
                 every = [keyframe.descriptors for keyframe in self.keyframes]
@@ -152,19 +155,19 @@ class PlaceMap:
         return self._index
 
     def learn(self) -> None:
-        """Words again from what the map holds now."""
+        """Learns the words from the current keyframes."""
         self.words, self._index = None, None
         self.index()
 
     def poses(self) -> Floats:
-        """(N, 3): x, y and yaw of every keyframe."""
+        """Returns (N, 3): x, y and yaw of every keyframe."""
         if len(self._poses) != len(self.keyframes):
             placed = [keyframe.T_map_keyframe for keyframe in self.keyframes]
             self._poses = np.array([(T.x_m, T.y_m, T.yaw_rad) for T in placed]).reshape(-1, 3)
         return self._poses
 
     def lines(self) -> list[MapLine]:
-        """The road's lines as its keyframes lie now, each whole where its pieces follow one another."""
+        """Returns the lane lines for the current poses of the keyframes, joined from adjacent pieces."""
         joined: dict[tuple[int, int], list[list[tuple[Floats, LinePiece]]]] = {}
         for keyframe in self.keyframes:
             for piece in keyframe.lines:
@@ -184,7 +187,7 @@ class PlaceMap:
         return out
 
     def near(self, T_map_ego: SE2, radius_m: float, among: Bools | None = None) -> list[int]:
-        """Rows of keyframes within the radius that look the same way, the nearest first."""
+        """Returns rows of keyframes within the radius and with a similar heading, nearest first."""
         poses = self.poses()
         if not len(poses):
             return []
@@ -197,7 +200,7 @@ class PlaceMap:
         return [int(row) for row in rows[np.argsort(distance[rows], kind="stable")]]
 
     def around(self, row: int, among: Bools | None = None, far: bool = False) -> LocalMap:
-        """A keyframe with those beside it, or with farther ones too."""
+        """Returns the points of a keyframe and its neighbours; `far`: also farther ones."""
         own = self.keyframes[row]
         reach_m, most = (FAR_NEIGHBOUR_M, FAR_NEIGHBOURS) if far else (NEIGHBOUR_M, NEIGHBOURS)
         rows = [other for other in self.near(own.T_map_keyframe, reach_m, among) if other != row]

@@ -1,7 +1,7 @@
-"""One drive and a map: localised in it, and the map made or made longer by it. Off the hot path.
+"""Localisation of one drive in a map, and mapping. Not real-time.
 
-Two frames (REP-105): odometry's, which never jumps, and the map's; `T_map_odom` joins them, with an epoch of its own.
-Keyframes of a drive that is not in the map yet wait until it is.
+Frames as in REP-105: `T_map_odom` relates odometry's frame, which does not jump, to the map frame, with its own epoch.
+Keyframes of a drive that is not localised yet are queued.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from birdslam.loops.map_pose import MapPose, MapState
 from birdslam.loops.place_map import PlaceMap
 from birdslam.types import Estimate
 
-COVERED_M = 2.5  # where the map has a keyframe this near, and knew the drive by it, it needs no further one
+COVERED_M = 2.5  # no new keyframe within this distance of one that the drive was localised by
 COVERED_INLIERS = 40
-OWN_WAY_M = 60.0  # of a drive's own keyframes only older ones can close a loop
-JOINT_EVERY_M = 25.0  # a drive over known streets leaves a keyframe so often, which ties its odometry to them
+OWN_WAY_M = 60.0  # min. distance travelled since an own keyframe that can close a loop
+JOINT_EVERY_M = 25.0  # interval of keyframes on known streets, which link odometry to the map
 LOOP_EVERY_M = 8.0  # between two links to the map
-CLOSE_EVERY_M = 50.0  # of way, from one optimisation of the map to the next where loops were found since
+CLOSE_EVERY_M = 50.0  # min. distance travelled between two optimizations of the map
 FIRST_COV = np.diag([1e-6, 1e-6, 1e-8])
 
 
@@ -53,16 +53,16 @@ class MapSession:
         self._last: Estimate | None = None
         self._travelled_m = 0.0
         self._looked_m, self._looked_ns = -math.inf, -(1 << 62)
-        self._own: list[tuple[int, float]] = []  # rows of this drive's keyframes, and the way at each
+        self._own: list[tuple[int, float]] = []  # rows of this drive's keyframes, distance travelled
         self._chain: tuple[int, SE2, float] | None = None  # the last keyframe: number, T_odom_keyframe, Look.unsure_m2
         self._linked_m, self._joint_m = -math.inf, -math.inf
         self._fixes: list[tuple[float, SE2, int, SE2, Floats]] = []
-        self._open_loops, self._closed_m = 0, -math.inf  # loops since the last optimisation, and the way there
+        self._open_loops, self._closed_m = 0, -math.inf  # loops since the last optimization, distance travelled there
         self._resumed: MapPose | None = None
-        self.lost_keyframes = 0  # that never found a place in the map
+        self.lost_keyframes = 0  # keyframes without a pose in the map
 
     def step(self, estimate: Estimate, image: NDArray[np.uint8] | None) -> Localisation:
-        """Where the ego of this frame is in the map."""
+        """Processes a frame; returns its localisation."""
         looked = image is not None and self.due(estimate)
         self._move(estimate)
         if self._extend:
@@ -87,16 +87,16 @@ class MapSession:
         )
 
     def resume(self, pose: MapPose) -> None:
-        """Before the first step: goes on where another session of the same drive had come to, in odometry's epoch."""
+        """Continues from the last pose of another session of the same drive; call it before the first step."""
         self._resumed = pose
 
     def due(self, estimate: Estimate) -> bool:
-        """Whether the image of the next frame is looked at."""
+        """Whether the image of the next frame is processed."""
         way_m = self._travelled_m + self._step_m(estimate) - self._looked_m
         return way_m >= LOOK_M or (way_m > 0.0 and estimate.t_source_ns - self._looked_ns >= LOOK_NS)
 
     def finish(self) -> None:
-        """The last keyframes, and the index of all."""
+        """Adds the last keyframes, optimizes the map and learns its index."""
         if not self._extend:
             return
         self._take(self._builder.finish())
@@ -107,7 +107,7 @@ class MapSession:
             self.map.learn()
 
     def _optimise(self) -> None:
-        """All keyframes by all links, where loops were found; the ego moves with the newest of them."""
+        """Optimizes the map if it has loops; the ego moves with the newest keyframe."""
         self._open_loops, self._closed_m = 0, self._travelled_m
         if not any(link.loop for link in self.map.links):
             return
@@ -128,14 +128,14 @@ class MapSession:
             self._place_origin(estimate)
 
     def _step_m(self, estimate: Estimate) -> float:
-        """The way from the frame before, in odometry of the same epoch."""
+        """Returns the distance from the previous frame, within one epoch of odometry."""
         if self._last is None or estimate.epoch != self._last.epoch:
             return 0.0
         step = self._last.T_world_ego.between(estimate.T_world_ego)
         return math.hypot(step.x_m, step.y_m)
 
     def _begin(self, estimate: Estimate) -> None:
-        """Odometry's frame begins; a new map's frame is that of its first drive."""
+        """Starts an epoch of odometry; the frame of a new map is that of its first drive."""
         if self._epoch is not None:
             self._take(self._builder.finish())
             self.lost_keyframes += len(self._waiting)
@@ -143,17 +143,17 @@ class MapSession:
             self._builder = KeyframeBuilder(self._camera, self._drive)
             self.localiser.lose()
         elif self._resumed is not None and self._resumed.epoch == estimate.epoch:
-            self._go_on(self._resumed)
+            self._resume_at(self._resumed)
         elif self._new_map and self._extend:
             self._place_origin(estimate)
         self._epoch = estimate.epoch
 
     def _place_origin(self, estimate: Estimate) -> None:
-        """Of a new map, which begins with the first valid frame."""
+        """Sets the origin of a new map at the current frame."""
         self.localiser.place(estimate.T_world_ego, estimate.T_world_ego, FIRST_COV)
 
-    def _go_on(self, pose: MapPose) -> None:
-        """From a pose of this epoch; the last keyframe's link to the next one is odometry's, as ever."""
+    def _resume_at(self, pose: MapPose) -> None:
+        """Continues from a pose of this epoch; an odometry link connects the last keyframe to the next one."""
         if pose.T_map_odom is None or pose.T_odom_ego is None or pose.cov is None:
             return
         since_fix_m = math.inf if pose.state is MapState.ODOMETRY_ONLY else 0.0
@@ -189,7 +189,7 @@ class MapSession:
             self._take(self._builder.add(look))
 
     def _among(self) -> Bools | None:
-        """Keyframes that the drive may be found by: all but those that it has just made itself."""
+        """Returns the keyframes allowed for localisation: all but the drive's latest ones."""
         recent = [row for row, way_m in self._own if self._travelled_m - way_m < OWN_WAY_M]
         if not recent:
             return None
@@ -198,7 +198,7 @@ class MapSession:
         return out
 
     def _remember_fix(self, look: Look) -> None:
-        """For the pose graph: this drive's pose in odometry against a keyframe of the map."""
+        """Stores the fix for a link of the pose graph."""
         fix = self.localiser.fix
         if fix is not None and self._travelled_m - self._linked_m >= LOOP_EVERY_M:
             self._linked_m = self._travelled_m
@@ -250,20 +250,20 @@ class MapSession:
         self._chain = number, new.look.T_odom_ego, new.look.unsure_m2
 
     def _give_lines(self, row: int, new: NewKeyframe, T_map_keyframe: SE2) -> None:
-        """To the map's keyframe in this place, if it has none."""
+        """Adds the lines to the map's keyframe at this place, if it has none."""
         old = self.map.keyframes[row]
         if not old.lines:
             T_old_new = old.T_map_keyframe.between(T_map_keyframe)
             self.map.keyframes[row] = replace(old, lines=tuple(piece.seen_from(T_old_new) for piece in new.lines))
 
     def _cov_at(self, new: NewKeyframe) -> Floats:
-        """Of a keyframe in the map, by what the localiser knows now and the way between."""
+        """Returns the covariance of a keyframe in the map, from the localiser's and the motion since."""
         assert self._last is not None
         step = self._last.T_world_ego.between(new.look.T_odom_ego)
         return moved(self.localiser.cov, step)
 
     def _close(self, new: NewKeyframe, number: int) -> None:
-        """Links of the keyframe to those of the map that fixes near it found."""
+        """Adds links from the keyframe to the keyframes of nearby fixes."""
         left = []
         for way_m, T_odom_ego, seen, T_seen_ego, cov in self._fixes:
             step = T_odom_ego.between(new.look.T_odom_ego)

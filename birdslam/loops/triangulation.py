@@ -1,7 +1,7 @@
-"""A keyframe's points: its features matched in the frames around it, triangulated over the metric ego-motion.
+"""Triangulates a keyframe's points from its features and their matches in the frames around it.
 
-Points are inverse depths along the keyframe's rays (Civera et al. 2008). Poses and depths are refined in turn: depths
-given the poses, then each pose given the depths with the odometry as its prior, which keeps the metres.
+Points are inverse depths along the keyframe's rays (Civera et al. 2008). Depths and poses are refined alternately;
+odometry is the prior of the poses and sets the scale.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from birdslam.geometry.pose import rotation_exp, rotation_log
 from birdslam.loops.features import Features, match
 from birdslam.trajectory import Transform, inverse
 
-MATCH_BITS = 60  # neighbouring frames look alike
+MATCH_BITS = 60  # max. distance between neighbouring frames
 MATCH_RATIO = 0.85
-MIN_FRAMES = 3  # besides the keyframe, that see a point
+MIN_FRAMES = 3  # with the point, besides the keyframe
 REFINEMENTS = 3
 MIN_DISTANCE_M, MAX_DISTANCE_M = 1.5, 120.0
 MAX_SIGMA_REL = 0.25
@@ -38,16 +38,16 @@ class View:
 
 @dataclass(frozen=True)
 class Points:
-    """Of a keyframe, in its camera's axes; `feature` is the row of each in the keyframe's features."""
+    """Points of a keyframe, in its camera frame; `feature`: their rows in the keyframe's features."""
 
     feature: Ints
     p_cam_m: Floats  # (N, 3)
     sigma_depth_rel: Floats  # (N,)
-    frames: Ints  # (N,) that saw it
+    frames: Ints  # (N,) number of frames with the point
 
 
 def triangulate(camera: Camera, keyframe: View, others: Sequence[View]) -> Points:
-    """The keyframe's points that the other frames confirm."""
+    """Returns the keyframe's points that the other frames confirm."""
     rays = np.column_stack([camera.to_xy(keyframe.features.px), np.ones(len(keyframe.features))])
     poses = np.array([inverse(view.T_odom_cam) @ keyframe.T_odom_cam for view in others])  # T_other_keyframe
     rows, views, px, sigma_px = _observations(keyframe.features, others)
@@ -69,7 +69,6 @@ def triangulate(camera: Camera, keyframe: View, others: Sequence[View]) -> Point
             poses[view] = _refined(poses[view], priors[view], rays[rows[mine]], rho[rows[mine]], xy[mine], sigma[mine])
     frames = np.bincount(rows[good], minlength=len(rays))
     sigma_rel = 1.0 / (np.sqrt(np.maximum(information, 1e-12)) * np.maximum(rho, 1e-6))
-    # A corner that the keyframe itself saw by a pixel wrong: as one more observation of each depth
     kept = np.flatnonzero(
         (frames >= MIN_FRAMES)
         & (rho > 1.0 / MAX_DISTANCE_M)
@@ -81,7 +80,7 @@ def triangulate(camera: Camera, keyframe: View, others: Sequence[View]) -> Point
 
 
 def _observations(own: Features, others: Sequence[View]) -> tuple[Ints, Ints, Floats, Floats]:
-    """(O,) the keyframe's feature, (O,) the frame, (O, 2) the pixel there and (O,) its sigma."""
+    """Returns the keyframe's feature (O,), the frame (O,), the pixel there (O, 2) and its sigma (O,)."""
     rows, views, px, sigma = [], [], [], []
     for number, view in enumerate(others):
         pairs = match(own.descriptors, view.features.descriptors, MATCH_BITS, MATCH_RATIO)
@@ -95,7 +94,7 @@ def _observations(own: Features, others: Sequence[View]) -> tuple[Ints, Ints, Fl
 
 
 def _projected(rays: Floats, rho: Floats, T: Transform) -> tuple[Floats, Floats]:
-    """Homogeneous points (O, 3), scaled by the inverse depth, and their z bounded from below; `T` (O, 4, 4)."""
+    """Returns points (O, 3) scaled by the inverse depth, and their z bounded from below; `T` (O, 4, 4)."""
     p = np.einsum("oij,oj->oi", T[:, :3, :3], rays) + rho[:, None] * T[:, :3, 3]
     return p, np.maximum(p[:, 2], 1e-3)
 
@@ -109,7 +108,7 @@ def _residuals(rays: Floats, rho: Floats, poses: Transform, rows: Ints, views: I
 def _depths(
     rays: Floats, rho: Floats, poses: Transform, rows: Ints, views: Ints, xy: Floats, sigma: Floats, good: Bools
 ) -> tuple[Floats, Floats]:
-    """Inverse depths by Gauss-Newton with Cauchy weights, and their information."""
+    """Returns inverse depths by Gauss-Newton with Cauchy weights, and their information."""
     T = poses[views]
     information: Floats = np.zeros(len(rho))
     for _ in range(6):
@@ -126,7 +125,7 @@ def _depths(
 
 
 def _refined(T: Transform, prior: Transform, rays: Floats, rho: Floats, xy: Floats, sigma: Floats) -> Transform:
-    """One frame's pose `T_other_keyframe` by Gauss-Newton on its points, with the odometry as prior."""
+    """Refines one frame's pose `T_other_keyframe` by Gauss-Newton on its points, with odometry as prior."""
     if len(rays) < 10:
         return T
     length_m = float(np.linalg.norm(prior[:3, 3]))
@@ -135,7 +134,7 @@ def _refined(T: Transform, prior: Transform, rays: Floats, rho: Floats, xy: Floa
     for _ in range(3):
         p, z = _projected(rays, rho, np.broadcast_to(T, (len(rays), 4, 4)))
         predicted = p[:, :2] / z[:, None]
-        # p = R ray + rho t; a step (dt, w) turns R by w and moves t, in the other camera's axes
+        # p = R ray + rho t; a step (dt, w) rotates R by w and moves t, in the other camera's frame
         turned = p - rho[:, None] * T[:3, 3]
         Jp = np.zeros((len(rays), 3, 6))
         Jp[:, :, :3] = rho[:, None, None] * np.eye(3)
@@ -155,7 +154,7 @@ def _refined(T: Transform, prior: Transform, rays: Floats, rho: Floats, xy: Floa
 
 
 def cross(v: Floats) -> Floats:
-    """(N, 3, 3) matrices of the cross product by `v` (N, 3)."""
+    """Returns the matrices (N, 3, 3) of the cross product with `v` (N, 3)."""
     out = np.zeros((len(v), 3, 3))
     out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
     out[:, 1, 0], out[:, 2, 0], out[:, 2, 1] = v[:, 2], -v[:, 1], v[:, 0]

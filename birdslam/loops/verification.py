@@ -1,8 +1,8 @@
-"""Where a frame is against points of the map: matches, PnP with RANSAC, and a pose in SE(2) with its covariance.
+"""Localises a frame against map points: matching, PnP with RANSAC, and a pose in SE(2) with its covariance.
 
-The camera's six degrees of freedom are adjusted, with height and tilt held near the road; the covariance is that of
-(x, y, yaw) with the others marginalised. Each residual is weighed by the corner's own noise and by the uncertain depth
-of its point, as seen from here; the depth is profiled out, each match having its own.
+All six degrees of freedom of the camera are estimated, with priors on height and tilt; the covariance is the marginal
+of (x, y, yaw). Residuals are weighted by the noise of the corner and the depth uncertainty of its point; the depth of
+each match is profiled out.
 """
 
 from __future__ import annotations
@@ -27,38 +27,38 @@ from birdslam.loops.triangulation import cross
 from birdslam.trajectory import Transform, ego_pose, inverse, mount_pose, split_pose
 from birdslam.types import Attitude
 
-MATCH_BITS, MATCH_RATIO = 72, 0.85  # where nothing is known of the pose
-GUIDED_BITS, GUIDED_RATIO = 80, 0.9  # where the pose says where to look
-GRID_CELLS = 8, 4  # across and down the image
-RANSAC_PX, RANSAC_LOOKS = 4.0, 400
+MATCH_BITS, MATCH_RATIO = 72, 0.85  # without a prediction
+GUIDED_BITS, GUIDED_RATIO = 80, 0.9  # with a prediction
+GRID_CELLS = 8, 4  # columns and rows
+RANSAC_PX, RANSAC_ITERATIONS = 4.0, 400
 GATE = 3.0  # standard deviations of a coordinate
-SIGMA_Z_M, SIGMA_TILT_RAD = 0.15, 0.03  # of a car on a road that another drive mapped
+SIGMA_Z_M, SIGMA_TILT_RAD = 0.15, 0.03  # priors of a car's height and tilt relative to the map
 ITERATIONS = 12
-FORESEEN_PX = 12.0  # within which matches are looked for again, once a pose was found by itself
-# Further maxima of the likelihood are looked for from so many starts forth and back, on the line of least knowledge
+FORESEEN_PX = 12.0  # radius of the second matching, after RANSAC
+# Number of further starts forwards and backwards along the direction of the largest variance, and their spacing
 STARTS, START_STEP_M = 4, 0.5
-MATCHES_AS_ONE = 4.0  # that err together, since their points are of one wall, or of one keyframe
+MATCHES_AS_ONE = 4.0  # number of matches with a common error
 TINY = 1e-12
-NARROWER = 3.0  # by which the weights' bell shrinks from one iteration to the next
-NARROWEST = 9.0  # its width at the end, as a chi-square
-# For residuals as foreseen the weighed mean of chi-square is 1.49, and the covariance .81 of the weighed system's (the
-# asymptotic variance of an M-estimator, Huber 1981); of larger ones both grow
+WIDTH_STEP_RATIO = 3.0  # by which the width of the weight function decreases per iteration
+MIN_WIDTH = 9.0  # its final width, as a chi-square
+# Expected weighted mean of chi-square, and the ratio of the covariance to the weighted system's (asymptotic variance of
+# an M-estimator, Huber 1981)
 MEAN_CHI2, EFFICIENCY = 1.4911, 0.8105
-OTHER_VIEW_PX = 1.0  # 1-sigma of a corner found again from another place and at another time, besides its own noise
+OTHER_VIEW_PX = 1.0  # additional 1-sigma of a corner seen from another place and at another time
 
 
 @dataclass(frozen=True, eq=False)
 class LocalMap:
-    """Points of keyframes near one of them, in its ego frame."""
+    """Points of a keyframe and its neighbours, in its ego frame."""
 
     keyframe: Keyframe
     points_m: Floats  # (N, 3)
-    along_m: Floats  # (N, 3) each point's sigma of depth, as a vector along the ray that it was seen by
+    along_m: Floats  # (N, 3) depth sigma of each point, as a vector along its ray
     descriptors: NDArray[np.uint8]  # (N, 32)
 
     @staticmethod
     def around(keyframe: Keyframe, neighbours: Sequence[Keyframe]) -> LocalMap:
-        """`neighbours`: those whose points are to be looked for too, without `keyframe` itself."""
+        """Collects the points of `keyframe` and of its `neighbours`."""
         points, along, descriptors = [], [], []
         back = inverse(keyframe.T_map)
         for other in (keyframe, *neighbours):
@@ -72,14 +72,14 @@ class LocalMap:
 
 @dataclass(frozen=True, eq=False)
 class Fix:
-    """Where an ego is against a keyframe, by one frame."""
+    """The pose of the ego relative to a keyframe, from one frame."""
 
     keyframe: Keyframe
     T_keyframe_ego: SE2
-    cov: Floats  # (3, 3) of the tangent at the pose, of this frame's noise alone
+    cov: Floats  # (3, 3) of the tangent at the pose, from this frame's noise
     inliers: int
     matches: int
-    places: int  # cells of the image that the inliers lie in
+    places: int  # image cells with inliers
     attitude: Attitude  # of the ego in the keyframe's frame
 
     @property
@@ -88,11 +88,11 @@ class Fix:
 
     @property
     def in_odometry(self) -> SE2:
-        """T_keyframe_ego in metres of the odometry that made the keyframe."""
+        """T_keyframe_ego in metres of the keyframe's odometry."""
         return self.T_keyframe_ego.scaled(1.0 / self.keyframe.scale)
 
     def attitude_in_map(self, camera: Camera) -> Attitude:
-        """Of the ego, with the keyframe's own."""
+        """Returns the attitude of the ego in the map, including the keyframe's."""
         T = self.keyframe.T_map @ body_pose(self.T_keyframe_ego, self.attitude, camera.height_m)
         return foot(T, camera.height_m)[1]
 
@@ -100,9 +100,9 @@ class Fix:
 def locate(
     camera: Camera, features: Features, local: LocalMap, guess: SE2 | None, radius_px: float = 60.0
 ) -> Fix | None:
-    """The ego of `features` against the local map; None where too little fits.
+    """Localises `features` in the local map; returns None with too few matches.
 
-    `guess` is T_keyframe_ego where it is known to `radius_px` in the image; without it the pose comes from RANSAC.
+    `guess`: T_keyframe_ego, accurate to `radius_px` in the image; without it the pose comes from RANSAC.
     """
     if len(features) < 8 or len(local.points_m) < 8:
         return None
@@ -115,7 +115,7 @@ def locate(
     if pose is None or len(pairs) < 8:
         return None
     matches = _Matches(camera, features, local, pairs, radius_px)
-    if guess is None:  # again, with what the pose foresees
+    if guess is None:  # match again with the predicted positions
         first = _adjust(matches, pose)
         pose = first.pose if first is not None else pose
         pairs = _guided(camera, features, local, pose, FORESEEN_PX)
@@ -130,24 +130,24 @@ class _Matches:
     features: Features
     local: LocalMap
     pairs: Ints  # (N, 2) rows of the local map's points, and of the features
-    radius_px: float  # within which they were looked for
+    radius_px: float  # search radius
 
 
 @dataclass(frozen=True, eq=False)
 class _Pose:
-    """One that the matches allow: a maximum of their likelihood."""
+    """A local maximum of the likelihood of the matches."""
 
     pose: Transform  # T_keyframe_ego
     cov: Floats  # (3, 3) of (x, y, yaw) of the foot
     good: Bools  # (N,) inliers
-    log_likelihood: float  # of each match either at its point, with its own noise, or anywhere within the radius
+    log_likelihood: float  # of matches that are inliers, or uniform within the radius
 
 
 def _likeliest(matches: _Matches, first: _Pose) -> Fix:
-    """The likeliest pose along the line on which the first one is known least; the covariance has the others in it.
+    """Returns the most likely pose along the direction of the largest variance; the covariance includes the others.
 
-    Where most matches are wrong, what fits far points has several maxima on that line, and the one nearest to the guess
-    may be a wrong one with as many inliers.
+    With many wrong matches the likelihood has several maxima along that direction, and the one nearest to the guess may
+    be wrong.
     """
     h = matches.camera.height_m
     at, attitude = foot(first.pose, h)
@@ -155,7 +155,7 @@ def _likeliest(matches: _Matches, first: _Pose) -> Fix:
     least = least / math.hypot(least[0], least[1])
     steps_m = [START_STEP_M * n for n in range(-STARTS, STARTS + 1) if n]
     starts = [body_pose(at @ SE2.exp(step_m * least), attitude, h) for step_m in steps_m]
-    found = [first, *filter(None, (_adjust(matches, start, NARROWEST) for start in starts))]
+    found = [first, *filter(None, (_adjust(matches, start, MIN_WIDTH) for start in starts))]
     best, *others = sorted(found, key=lambda each: -each.log_likelihood)
     T_best, attitude = foot(best.pose, h)
     offs, weights = [np.zeros(3)], [1.0]
@@ -173,7 +173,7 @@ def _likeliest(matches: _Matches, first: _Pose) -> Fix:
 
 
 def _camera_pose(camera: Camera, T_keyframe_ego: Transform) -> Transform:
-    """`T_cam_keyframe`."""
+    """Returns `T_cam_keyframe`."""
     return inverse(T_keyframe_ego @ mount_pose(camera.ground))
 
 
@@ -185,7 +185,7 @@ def _ransac(camera: Camera, features: Features, local: LocalMap, pairs: Ints) ->
         features.px[pairs[:, 1]],
         camera.K,
         None,
-        iterationsCount=RANSAC_LOOKS,
+        iterationsCount=RANSAC_ITERATIONS,
         reprojectionError=RANSAC_PX * max(1.0, float(np.median(features.sigma_px))),
         confidence=0.999,
         flags=cv2.SOLVEPNP_AP3P,
@@ -199,13 +199,13 @@ def _ransac(camera: Camera, features: Features, local: LocalMap, pairs: Ints) ->
         return None, pairs
     pose = inverse(mount_pose(camera.ground) @ T_cam_keyframe)
     tilt = abs(split_pose(pose)[1].pitch_rad) + abs(split_pose(pose)[1].roll_rad)
-    if tilt > 6.0 * SIGMA_TILT_RAD or abs(pose[2, 3]) > 1.0:  # no car on this road
+    if tilt > 6.0 * SIGMA_TILT_RAD or abs(pose[2, 3]) > 1.0:  # implausible for a car on this road
         return None, pairs
     return pose, pairs[inliers.ravel()]
 
 
 def _guided(camera: Camera, features: Features, local: LocalMap, pose: Transform, radius_px: float) -> Ints:
-    """Matches within `radius_px` of where the pose puts each point."""
+    """Returns the matches within `radius_px` of each projected point."""
     T = _camera_pose(camera, pose)
     p = local.points_m @ T[:3, :3].T + T[:3, 3]
     rows = np.flatnonzero(p[:, 2] > 1.0)
@@ -216,8 +216,8 @@ def _guided(camera: Camera, features: Features, local: LocalMap, pose: Transform
     return np.column_stack([rows[pairs[:, 0]], pairs[:, 1]])
 
 
-def _of_a_step(p_ego: Floats, mount: Transform) -> Floats:
-    """(N, 2, 6) of the image coordinates of points (N, 3) in the ego's frame, by a step of the ego in its own frame."""
+def _jacobian(p_ego: Floats, mount: Transform) -> Floats:
+    """Returns the Jacobian (N, 2, 6) of image coordinates of points (N, 3) in ego by a step of the ego in its frame."""
     R_cam_ego = mount[:3, :3].T
     p = (p_ego - mount[:3, 3]) @ R_cam_ego.T
     z = np.maximum(p[:, 2], 0.3)
@@ -229,10 +229,10 @@ def _of_a_step(p_ego: Floats, mount: Transform) -> Floats:
 
 
 def _adjust(matches: _Matches, pose: Transform, width: float = math.inf) -> _Pose | None:
-    """Gauss-Newton from a pose, with weights of Geman and McClure.
+    """Refines a pose by Gauss-Newton with Geman-McClure weights.
 
-    Graduated (Black and Rangarajan 1996): the weights are wide at first, or far points alone would hold a wrong guess;
-    `width` is that of the weights' bell at the start, in standard deviations, squared.
+    Graduated non-convexity (Black and Rangarajan 1996): the width of the weight function decreases from `width`, a
+    chi-square; narrow weights at the start would keep a wrong guess by its far points.
     """
     camera, features, local, pairs = matches.camera, matches.features, matches.local, matches.pairs
     if len(pairs) < 8:
@@ -253,17 +253,17 @@ def _adjust(matches: _Matches, pose: Transform, width: float = math.inf) -> _Pos
         z = np.maximum(p[:, 2], 0.3)
         predicted = p[:, :2] / z[:, None]
         along_cam = along @ pose[:3, :3] @ R_cam_ego.T
-        blur = (along_cam[:, :2] - predicted * along_cam[:, 2:3]) / z[:, None]  # 1-sigma of the depth, in this image
+        blur = (along_cam[:, :2] - predicted * along_cam[:, 2:3]) / z[:, None]  # of the 1-sigma depth, in the image
         error = xy - predicted
-        # J at the depth that the match makes likeliest: at the map's own, whose error is in `error` too, it would
-        # attenuate how far the ego is aside (errors in variables, Fuller 1987)
+        # J at the most likely depth of the match; at the map's depth the lateral offset would be attenuated (errors in
+        # variables, Fuller 1987)
         sigmas = (blur * error).sum(axis=1) / (noise + (blur**2).sum(axis=1))
         q_ego = p_ego + np.clip(sigmas, -GATE, GATE)[:, None] * (along @ pose[:3, :3])
-        J = _of_a_step(q_ego, mount)
+        J = _jacobian(q_ego, mount)
         W = np.linalg.inv(noise[:, None, None] * np.eye(2) + blur[:, :, None] * blur[:, None, :])
         chi2 = (error * (W @ error[:, :, None])[:, :, 0]).sum(axis=1)
         good = (chi2 < GATE**2) & (p[:, 2] > 0.5)
-        width = max(min(width / NARROWER, float(np.median(chi2))), NARROWEST)
+        width = max(min(width / WIDTH_STEP_RATIO, float(np.median(chi2))), MIN_WIDTH)
         weight = (p[:, 2] > 0.5) / (1.0 + chi2 / width) ** 2
         weighed = (weight[:, None, None] * (W @ J)).reshape(-1, 6)
         H = weighed.T @ J.reshape(-1, 6)
@@ -277,14 +277,14 @@ def _adjust(matches: _Matches, pose: Transform, width: float = math.inf) -> _Pos
         pose = pose.copy()
         pose[:3, 3] += pose[:3, :3] @ np.clip(step[:3], -2.0, 2.0)
         pose[:3, :3] = pose[:3, :3] @ rotation_exp(step[3:])
-        if width == NARROWEST and float(np.abs(step).max()) < 1e-5:
+        if width == MIN_WIDTH and float(np.abs(step).max()) < 1e-5:
             break
     if not good.any() or abs(pose[2, 3]) > 1.5 or math.hypot(*pose[:2, 3]) > 60.0:
         return None
     h = camera.height_m
-    J_foot = np.array([[1, 0, 0, 0, h, 0], [0, 1, 0, -h, 0, 0], [0, 0, 0, 0, 0, 1]])  # the foot, by a step of the body
+    J_foot = np.array([[1, 0, 0, 0, h, 0], [0, 1, 0, -h, 0, 0], [0, 0, 0, 0, 0, 1]])  # foot by body
     cov: Floats = J_foot @ np.linalg.inv(H) @ J_foot.T
-    # The a posteriori variance of unit weight: residuals of an image with few right matches are larger than foreseen
+    # The a posteriori variance of unit weight
     cov *= EFFICIENCY * max(1.0, float((weight * chi2).sum() / weight.sum()) / MEAN_CHI2)
     share = float(good.mean())
     right = share * np.sqrt(np.linalg.det(W)) / (2.0 * math.pi) * np.exp(-0.5 * chi2)

@@ -15,8 +15,8 @@ from scipy.spatial import cKDTree
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.drift import link_cov
-from birdslam.loops.gnss.earth import Earth, EarthError, GnssFix, place_on_earth
-from birdslam.loops.gnss.factors import Node, OnEarth, fixed_keyframes, tie
+from birdslam.loops.gnss.earth import Earth, EarthError, GnssFix, align_with_fixes
+from birdslam.loops.gnss.factors import Node, OnEarth, fixed_keyframes, georeference
 from birdslam.loops.gnss.files import Track
 from birdslam.loops.keyframe import Link, Placed
 from birdslam.loops.keyframe_builder import SPACING_M
@@ -55,13 +55,13 @@ def write_earth(
     track = fixes_from(places[0].t_source_ns) if callable(fixes_from) else Track(list(fixes_from))
     fixes = track.fixes
     t_ns, way = np.array([each.t_source_ns for each in places], np.int64), [each.T_map_ego for each in places]
-    earth = place_on_earth(t_ns, way, fixes, track.clock_is_known)
+    earth = align_with_fixes(t_ns, way, fixes, track.clock_is_known)
     nodes: Sequence[Placed]
     if place_map is not None and len(place_map):
         nodes, links, before = place_map.keyframes, place_map.links, place_map.fixed()
     else:
         nodes, links, before = *_nodes(way), {}
-    found = tie(earth, nodes, links, before | fixed_keyframes(earth, t_ns, way, fixes, nodes))
+    found = georeference(earth, nodes, links, before | fixed_keyframes(earth, t_ns, way, fixes, nodes))
     bent = _bent(way, nodes, found)
     degrees = found.earth.wgs84(np.array([(pose.x_m, pose.y_m) for pose in bent]))
     about = figures(found.earth, camera)
@@ -70,7 +70,7 @@ def write_earth(
     for suffix in SUFFIXES:
         write_ways(output / f"ego{suffix}", [line])
     if place_map is not None and len(place_map):
-        place_map.come_to_earth(found)
+        place_map.georeference(found)
     return about, [
         replace(place, T_map_ego=pose, earth=(lat, lon, found.earth.yaw_rad + pose.yaw_rad, found.earth.scale))
         for place, pose, (lat, lon) in zip(places, bent, degrees.tolist(), strict=True)

@@ -1,1 +1,1 @@
-"""A place on Earth: fixes read, and drives and maps tied to WGS 84 by them."""
+"""GNSS fixes: reading, and georeferencing of drives and maps in WGS 84."""

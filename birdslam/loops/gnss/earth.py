@@ -1,8 +1,7 @@
-"""Where a drive is on Earth: its frame tied to WGS 84 by GNSS fixes, with a gate against wrong ones.
+"""Aligns the frame of a drive with WGS 84 by GNSS fixes, robust to outliers.
 
-Fixes are joined to the drive's own way by their time. One similarity of the plane (turn, shift and scale, since metres
-are odometry's) is adjusted to all of them with Cauchy weights, together with the fixes' delay. What a wrong fix says is
-out of the gate; jumps and multipath of some seconds do not turn a way that odometry holds together.
+Fixes are assigned to the trajectory by their time. A similarity of the plane (rotation, translation, scale) is fitted
+to all of them with Cauchy weights, together with the fixes' delay.
 """
 
 from __future__ import annotations
@@ -19,34 +18,34 @@ from birdslam.geometry.se2 import SE2, wrap
 from birdslam.loops.map_pose import EarthPose
 from birdslam.types import NS_PER_S
 
-MIN_FIXES, MIN_WAY_M = 3, 20.0
+MIN_FIXES, MIN_EXTENT_M = 3, 20.0
 GATE = 3.0  # standard deviations
 DELAYS_S = np.arange(-2.0, 2.01, 0.1)
 DELAY_SIGMA_S = 0.5
-WINDOW_S, MAX_WINDOWS = 60.0, 10  # in which fixes are compared with odometry for their delay
-OFFSET_STEP_S, MAX_OFFSETS = 1.0, 3600  # of the parts of a longer track that are compared with a drive
-SURE_COST = math.log(1000.0)  # by which the best part has to be better than every other
-START_FIXES = 60  # whose pairs are tried for a start
-START_REL = 0.1  # drift of odometry over the distance from the centre, up to which a fix agrees with a start
+WINDOW_S, MAX_WINDOWS = 60.0, 10  # for the estimate of the delay
+OFFSET_STEP_S, MAX_OFFSETS = 1.0, 3600  # for the search of a drive within a longer track
+SURE_COST = math.log(1000.0)  # min. difference of costs between the best part and all others
+START_FIXES = 60  # whose pairs give initial values
+START_REL = 0.1  # max. drift of an inlier relative to its distance from the centre
 ITERATIONS, WINDOW_ITERATIONS = 30, 16
-SCALE_SIGMA = 0.1  # of the scale's logarithm, by the camera's file
-SPEED_SIGMA = 0.01  # of all speeds of a drive together, which receivers smooth
-DEFAULT_SIGMA_M = 5.0  # of a fix that does not say its own
-HINT_SIGMAS, HINT_REL = 3.0, 0.02  # a wrong height, or view, is reported where it is that sure, and that large
+SCALE_SIGMA = 0.1  # prior of the log scale, by the camera file
+SPEED_SIGMA = 0.01  # common relative error of the receiver's speeds
+DEFAULT_SIGMA_M = 5.0  # of a fix without an accuracy
+HINT_SIGMAS, HINT_REL = 3.0, 0.02  # min. significance and size of a reported scale error
 
 
 class GnssFix(msgspec.Struct, frozen=True, kw_only=True):
-    """One fix, by the recording's clock."""
+    """One fix, on the recording's clock."""
 
     t_source_ns: int
     latitude_deg: float
     longitude_deg: float
-    sigma_m: float = DEFAULT_SIGMA_M  # 1-sigma, across the ground
+    sigma_m: float = DEFAULT_SIGMA_M  # horizontal 1-sigma
     speed_mps: float | None = None
 
 
 def is_on_earth(latitude_deg: float, longitude_deg: float) -> bool:
-    """Whether there is such a place; NaN is none."""
+    """Whether latitude and longitude are valid; NaN is not."""
     return abs(latitude_deg) <= 90.0 and abs(longitude_deg) <= 180.0
 
 
@@ -56,35 +55,35 @@ class EarthError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Earth:
-    """East and north in metres from the origin: `scale` R(`yaw_rad`) p + (`east_m`, `north_m`)."""
+    """The georeference of a map: east and north from the origin are `scale` R(`yaw_rad`) p + (`east_m`, `north_m`)."""
 
     latitude_deg: float  # of the origin
     longitude_deg: float
     east_m: float
     north_m: float
     yaw_rad: float  # of the map's x axis from east, counter-clockwise
-    scale: float  # of Earth's metres over the map's
+    scale: float  # metres on Earth over map metres
     cov: Floats  # (4, 4) of east_m, north_m, yaw_rad, log scale
-    delay_s: float  # by which the fixes' times lie behind the images'
+    delay_s: float  # of the fixes relative to the images
     fixes: int
     outliers: int
     rms_m: float  # of the inliers
-    speed_ratio: float | None  # of the drive's speed over the fixes' own, the median; None: they have none
-    late_m: float = 0.0  # 1-sigma by which the delay, as far as it is not known, puts all places off
-    log_scale: tuple[float, float] = (0.0, SCALE_SIGMA)  # of what is known beside the places, with its 1-sigma
+    speed_ratio: float | None  # median of the drive's speed over the fixes' speed; None: they have none
+    late_m: float = 0.0  # 1-sigma of all positions from the uncertainty of the delay
+    log_scale: tuple[float, float] = (0.0, SCALE_SIGMA)  # prior of the log scale with its 1-sigma
 
     def with_cov(self, cov: Floats) -> Earth:
-        """`cov` (4, 4) is that of the fixes alone."""
+        """Sets the covariance; `cov` (4, 4) is that of the fixes, without the delay."""
         return replace(self, cov=cov + np.diag([self.late_m**2, self.late_m**2, 0.0, 0.0]))
 
     def enu(self, xy_m: Floats) -> Floats:
-        """(N, 2) east and north of points of the map (N, 2)."""
+        """Converts map points (N, 2) to east and north (N, 2)."""
         c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
         return self.scale * (xy_m @ np.array([[c, s], [-s, c]])) + (self.east_m, self.north_m)
 
     def wgs84(self, xy_m: Floats) -> Floats:
-        """(N, 2) latitude and longitude in degrees of points of the map (N, 2)."""
-        import pymap3d  # here: only who goes to Earth needs it
+        """Converts map points (N, 2) to latitude and longitude in degrees (N, 2)."""
+        import pymap3d
 
         enu = self.enu(np.asarray(xy_m, np.float64).reshape(-1, 2))
         zero = np.zeros(len(enu))
@@ -92,8 +91,8 @@ class Earth:
         return np.column_stack([np.atleast_1d(lat), np.atleast_1d(lon)])
 
     def xy(self, degrees: Floats) -> Floats:
-        """(N, 2) in the map of latitudes and longitudes in degrees (N, 2)."""
-        import pymap3d  # here: only who comes from Earth needs it
+        """Converts latitudes and longitudes in degrees (N, 2) to map points (N, 2)."""
+        import pymap3d
 
         east, north, _ = pymap3d.geodetic2enu(
             degrees[:, 0], degrees[:, 1], 0.0, self.latitude_deg, self.longitude_deg, 0.0
@@ -104,13 +103,13 @@ class Earth:
         return out
 
     def seen_from(self, T_other_map: SE2) -> Earth:
-        """The same place in another map's frame."""
+        """Returns the georeference of another map's frame."""
         T = T_other_map.inverse()
         east, north = (float(number) for number in self.enu(np.array([[T.x_m, T.y_m]]))[0])
         return replace(self, east_m=east, north_m=north, yaw_rad=wrap(self.yaw_rad + T.yaw_rad))
 
     def pose(self, T_map_ego: SE2, cov: Floats) -> EarthPose:
-        """An ego of the map on Earth; `cov` (3, 3), of the tangent there: its own, and that of the map around it."""
+        """Converts a pose in the map to Earth; `cov` (3, 3): of the tangent, including the map's covariance there."""
         p = np.array([T_map_ego.x_m, T_map_ego.y_m])
         latitude_deg, longitude_deg = (float(number) for number in self.wgs84(p[None])[0])
         yaw_rad = wrap(self.yaw_rad + T_map_ego.yaw_rad)
@@ -129,9 +128,9 @@ class Earth:
         )
 
     def calibration_hint(self, camera: Camera) -> str:
-        """What the metres of the fixes say of the camera's file; "" where they say nothing against it.
+        """Returns a correction of the camera file by the fixes' scale; "" if none is significant.
 
-        Our metres are in proportion to the height, and about to the focal length: a straight way can't tell which.
+        Lengths are proportional to the height, and about to the focal length: a straight road does not separate them.
         """
         sigma = math.sqrt(self.cov[3, 3])
         if abs(math.log(self.scale)) < max(HINT_SIGMAS * sigma, HINT_REL):
@@ -139,24 +138,24 @@ class Earth:
         height_m = camera.height_m
         now_deg, fits_deg = (_view_deg(camera, scale) for scale in (1.0, self.scale))
         return (
-            f"camera height {height_m * self.scale:.2f} m instead of {height_m:.2f} m fits GNSS "
-            f"(within {height_m * self.scale * 2.0 * sigma:.2f} m); or, if the height was measured, a view of "
-            f"{fits_deg:.0f} degrees across instead of {now_deg:.0f}"
+            f"a camera height of {height_m * self.scale:.2f} m instead of {height_m:.2f} m fits GNSS "
+            f"(+- {height_m * self.scale * 2.0 * sigma:.2f} m); or, if the height was measured, a field of view of "
+            f"{fits_deg:.0f} degrees instead of {now_deg:.0f}"
         )
 
 
 def _view_deg(camera: Camera, scale: float) -> float:
-    """By a multiple of the camera's focal length, without distortion."""
+    """Returns the horizontal field of view for a multiple of the focal length, without distortion."""
     half = 0.5 * camera.width_px / (scale * camera.fx_px)
     return 2.0 * math.degrees(half if camera.fisheye else math.atan(half))
 
 
-def place_on_earth(t_ns: Ints, poses: list[SE2], fixes: list[GnssFix], clock_is_known: bool = True) -> Earth:
-    """Returns the map's frame on Earth, by a drive's poses in it (times growing) and its fixes. Raises EarthError.
+def align_with_fixes(t_ns: Ints, poses: list[SE2], fixes: list[GnssFix], clock_is_known: bool = True) -> Earth:
+    """Aligns a drive's poses, with increasing times, with its fixes. Raises EarthError.
 
-    Where the fixes have another clock, the part of their track that has the shape of the drive is found first.
+    If the fixes have an unrelated clock, the part of their track with the shape of the drive is searched first.
     """
-    import pymap3d  # here: only who goes to Earth needs it
+    import pymap3d
 
     if not fixes or len(poses) < 2:
         raise EarthError("there are no fixes within the drive")
@@ -174,17 +173,17 @@ def place_on_earth(t_ns: Ints, poses: list[SE2], fixes: list[GnssFix], clock_is_
     at = times - delay_s
     inside = (at >= seconds[0]) & (at <= seconds[-1])
     if inside.sum() < MIN_FIXES:
-        raise EarthError(f"{len(fixes)} fixes, and fewer than {MIN_FIXES} of them within the drive's time")
+        raise EarthError(f"fewer than {MIN_FIXES} of {len(fixes)} fixes are within the drive's time")
     here = np.column_stack([np.interp(at[inside], seconds, column) for column in xy.T])
     ratios = _speed_ratios(seconds, xy, times - delay_s, fixes)
     log_scale = _log_scale(ratios)
     parameters, cov, chi2 = fit(here, enu[inside], sigma[inside], log_scale=log_scale)
     way_m = float(np.linalg.norm(np.ptp(here, axis=0)))
-    if way_m < MIN_WAY_M:
-        raise EarthError(f"the drive goes {way_m:.0f} m between its fixes: {MIN_WAY_M:g} m are needed for a heading")
+    if way_m < MIN_EXTENT_M:
+        raise EarthError(f"the fixes extend over {way_m:.0f} m: {MIN_EXTENT_M:g} m are needed for a heading")
     good = chi2 < GATE**2
     if good.sum() < MIN_FIXES:
-        raise EarthError(f"only {int(good.sum())} of {len(chi2)} fixes fit the drive's way")
+        raise EarthError(f"only {int(good.sum())} of {len(chi2)} fixes fit the trajectory")
     error_m = np.sqrt(chi2[good]) * sigma[inside][good]
     return Earth(
         *origin,
@@ -233,9 +232,9 @@ def _offset_s(seconds: Floats, xy: Floats, times: Floats, enu: Floats, sigma: Fl
 
 
 def _delay(seconds: Floats, xy: Floats, times: Floats, enu: Floats, sigma: Floats) -> tuple[float, float]:
-    """By how much fixes come late, and its 1-sigma: what fits best over short windows, before odometry drifts far.
+    """Estimates the delay of the fixes and its 1-sigma, over short windows with little drift.
 
-    Curves and changes of speed tell delays apart; where there are none the prior keeps them at 0.
+    The delay is observable in curves and at changes of speed; else the prior keeps it at 0.
     """
     begin, windows = 0, []
     for end in range(1, len(times) + 1):
@@ -268,10 +267,10 @@ def fit(
     iterations: int = ITERATIONS,
     log_scale: tuple[float, float] = (0.0, SCALE_SIGMA),
 ) -> tuple[Floats, Floats, Floats]:
-    """(east, north, yaw, log scale), their covariance, and each fix's chi-square; Gauss-Newton with Cauchy weights.
+    """Returns (east, north, yaw, log scale), their covariance, and each fix's chi-square.
 
-    `log_scale`: what is known of it beforehand, with its 1-sigma.
-    The start is the pair of fixes that most others agree with (RANSAC over all pairs of evenly spaced fixes).
+    Gauss-Newton with Cauchy weights, initialized by RANSAC over pairs of evenly spaced fixes. `log_scale`: prior with
+    its 1-sigma.
     """
     centre = np.median(xy, axis=0)
     a = xy - centre
@@ -304,7 +303,7 @@ def fit(
 
 
 def _start(a: Floats, enu: Floats, sigma: Floats, scale: float) -> tuple[float, Floats]:
-    """Yaw and shift (2,) of `enu` over `a` (N, 2) by the pair of points with the least sum of truncated errors."""
+    """Returns the yaw and translation (2,) from `a` (N, 2) to `enu` with the least sum of truncated errors."""
     p, q = scale * (a[:, 0] + 1j * a[:, 1]), enu[:, 0] + 1j * enu[:, 1]
     some = np.unique(np.linspace(0, len(p) - 1, START_FIXES).astype(int))
     i, j = (some[k] for k in np.triu_indices(len(some), 1))
@@ -320,13 +319,13 @@ def _start(a: Floats, enu: Floats, sigma: Floats, scale: float) -> tuple[float, 
 
 
 def _central(degrees: Floats) -> tuple[float, float]:
-    """The fix (latitude, longitude) that is nearest to the median of all: a single one may be anywhere."""
+    """Returns the fix (latitude, longitude) nearest to the median, since a single fix may be an outlier."""
     nearest = int(np.abs(degrees - np.median(degrees, axis=0)).sum(axis=1).argmin())
     return float(degrees[nearest, 0]), float(degrees[nearest, 1])
 
 
 def _speed_ratios(seconds: Floats, xy: Floats, at: Floats, fixes: list[GnssFix]) -> list[float]:
-    """Of ours over theirs, in each second around a fix that tells its speed."""
+    """Returns the ratio of the drive's speed to each fix's speed, over one second."""
     ratios = []
     for t, fix in zip(at, fixes, strict=True):
         if fix.speed_mps is None or fix.speed_mps < 3.0 or t - 0.5 < seconds[0] or t + 0.5 > seconds[-1]:
@@ -339,7 +338,7 @@ def _speed_ratios(seconds: Floats, xy: Floats, at: Floats, fixes: list[GnssFix])
 
 
 def _log_scale(ratios: list[float]) -> tuple[float, float]:
-    """What the fixes' speeds, by their median, and the camera's file tell of the scale."""
+    """Returns the prior of the log scale from the fixes' speeds and the camera file."""
     by_file = SCALE_SIGMA**-2
     if len(ratios) < MIN_FIXES:
         return 0.0, SCALE_SIGMA

@@ -1,11 +1,9 @@
-"""Fixes of GNSS as factors of a map's graph: the drive's bends are taken out, and the map comes to its place on Earth.
+"""GNSS fixes as factors of a map's graph, which removes drift and georeferences the map.
 
-1. The drive as odometry has it is laid over its fixes (`place_on_earth`): delay, turn, shift, scale.
-2. Each keyframe gets the fix nearest to it, brought there along the way.
-3. Graduated non-convexity tells the fixes that fit from jumps and multipath.
-4. Keyframes and links and fixes are one graph, in metres of the map, east and north; the scale is adjusted to what the
-   fixes made of the links, and the graph is solved again.
-5. The map keeps the pose of its first keyframe, and `Earth` is fitted to its keyframes' fixes.
+1. `align_with_fixes` aligns odometry's trajectory with the fixes: delay, rotation, translation, scale.
+2. Each keyframe gets its nearest fix, moved along the trajectory. Graduated non-convexity rejects outliers.
+3. The graph of keyframes, links and fixes is solved in map metres, east and north; the scale is updated, and the graph
+   solved again. The first keyframe keeps its pose in the map, and `Earth` is fitted to the keyframes' fixes.
 """
 
 from __future__ import annotations
@@ -23,14 +21,14 @@ from birdslam.loops.gnss.earth import MIN_FIXES, Earth, EarthError, GnssFix, fit
 from birdslam.loops.keyframe import Fixed, Link, Placed
 from birdslam.types import NS_PER_S
 
-REACH_M = 6.0  # from a fix to its keyframe, along the way
-SHARED_S = 10.0  # errors of fixes so near in time are one error; a judgement
-ROUNDS = 2  # of the scale: keyframes have their own, and take up the rest
+REACH_M = 6.0  # max. distance of a fix from its keyframe
+SHARED_S = 10.0  # fixes within this time have a common error; by judgement
+ROUNDS = 2  # of the scale
 
 
 @dataclass(frozen=True)
 class Node:
-    """A place of a drive that has no map: as a keyframe, without points."""
+    """A node of a drive without a map: a keyframe without points."""
 
     number: int
     T_map_keyframe: SE2
@@ -39,18 +37,18 @@ class Node:
 
 @dataclass(frozen=True, eq=False)
 class OnEarth:
-    """What fixes made of a graph."""
+    """A georeferenced graph."""
 
     earth: Earth
     poses: dict[int, Solved]  # of each keyframe in the map
-    fixed: dict[int, Fixed]  # the fixes that fit, by their keyframes
+    fixed: dict[int, Fixed]  # inlier fixes by keyframe
 
 
 def fixed_keyframes(
     earth: Earth, t_ns: Ints, poses: Sequence[SE2], fixes: Sequence[GnssFix], keyframes: Sequence[Placed]
 ) -> dict[int, Fixed]:
-    """The fix nearest to each keyframe, of a drive that `earth` was laid over."""
-    from scipy.spatial import cKDTree  # here: only who has fixes needs it
+    """Assigns to each keyframe its nearest fix, given the drive's alignment `earth`."""
+    from scipy.spatial import cKDTree
 
     xy = np.array([(pose.x_m, pose.y_m) for pose in poses])
     seconds = (t_ns - t_ns[0]) / NS_PER_S
@@ -76,8 +74,8 @@ def fixed_keyframes(
     return out
 
 
-def tie(earth: Earth, keyframes: Sequence[Placed], links: Sequence[Link], fixed: dict[int, Fixed]) -> OnEarth:
-    """The graph with its fixes. Raises EarthError where too few of them fit."""
+def georeference(earth: Earth, keyframes: Sequence[Placed], links: Sequence[Link], fixed: dict[int, Fixed]) -> OnEarth:
+    """Solves the graph with its fixes. Raises EarthError with too few inliers."""
     first, numbers = keyframes[0], list(fixed)
     degrees = np.array([(fixed[number].latitude_deg, fixed[number].longitude_deg) for number in numbers])
     kept = np.ones(len(numbers), bool)
@@ -93,7 +91,7 @@ def tie(earth: Earth, keyframes: Sequence[Placed], links: Sequence[Link], fixed:
         ]
         kept = inliers(nodes, links, factors)
         if kept.sum() < MIN_FIXES:
-            raise EarthError(f"only {int(kept.sum())} of {len(kept)} fixes fit the drive's way")
+            raise EarthError(f"only {int(kept.sum())} of {len(kept)} fixes fit the trajectory")
         solved = close_loops(nodes, links, [factor for factor, fits in zip(factors, kept, strict=True) if fits])
         T_map_earth = first.T_map_keyframe @ solved[first.number][0].inverse()
         poses = {number: each._replace(T_map_keyframe=T_map_earth @ each[0]) for number, each in solved.items()}
@@ -105,7 +103,7 @@ def tie(earth: Earth, keyframes: Sequence[Placed], links: Sequence[Link], fixed:
 
 
 def _stretch(links: Sequence[Link], poses: dict[int, Solved]) -> float:
-    """By how much longer the fixes made odometry's links."""
+    """Returns the ratio by which the fixes lengthened odometry's links."""
     asked = total = 0.0
     for link in links:
         if not link.loop:
@@ -116,7 +114,7 @@ def _stretch(links: Sequence[Link], poses: dict[int, Solved]) -> float:
 
 
 def _fitted(earth: Earth, poses: dict[int, Solved], fixed: dict[int, Fixed], numbers: list[int]) -> Earth:
-    """Earth by the keyframes as they lie now, and the fixes that fit."""
+    """Fits the georeference to the current keyframes and the inlier fixes."""
     flat = replace(earth, east_m=0.0, north_m=0.0, yaw_rad=0.0, scale=1.0)
     degrees = np.array([(fixed[number].latitude_deg, fixed[number].longitude_deg) for number in numbers])
     xy = np.array([(poses[number][0].x_m, poses[number][0].y_m) for number in numbers])

@@ -24,8 +24,8 @@ MAX_S = 4e9  # of a time in seconds, either way
 DAY_S = 86_400.0
 UNIX_FROM_S = 1e9  # a time in seconds from here on is Unix time: 2001 and later
 NMEA_LINES = 50  # among so many first lines one is a sentence
-GNSS_FILE = "gnss.csv"  # of the fixes that came while a car drove, in the drive's folder
-COLUMNS = "time_s, latitude_deg, longitude_deg, and where known sigma_m, speed_mps"
+GNSS_FILE = "gnss.csv"  # fixes received during a drive, in its folder
+COLUMNS = "time_s, latitude_deg, longitude_deg, and optionally sigma_m, speed_mps"
 _NAMES = {  # other names of the columns, and the factor to our unit
     **dict.fromkeys(("t_s", "time", "t", "timestamp_s", "seconds", "unix_s"), ("time_s", 1.0)),
     **dict.fromkeys(("latitude", "lat"), ("latitude_deg", 1.0)),
@@ -99,7 +99,7 @@ def read_track(data: bytes, name: str, begin_ns: int, offset_s: float | None = N
 def checked_fix(
     name: str, t_source_ns: int, latitude_deg: float, longitude_deg: float, sigma_m: float, speed_mps: float | None
 ) -> GnssFix:
-    """A fix of a stream. Raises GnssError where it is none."""
+    """Checks a fix of a stream. Raises GnssError if it is invalid."""
     _checked(name, 0, t_source_ns / NS_PER_S, latitude_deg, longitude_deg, sigma_m, speed_mps)
     return GnssFix(
         t_source_ns=t_source_ns,
@@ -117,7 +117,7 @@ def _checked(name: str, line: int, t_s: float, lat: float, lon: float, sigma_m: 
     whole = math.isfinite(t_s) and abs(t_s) < MAX_S and is_on_earth(lat, lon)
     fine = math.isfinite(sigma_m) and 0.0 < sigma_m < 1e5 and (speed is None or 0.0 <= speed < 200.0)
     if not (whole and fine):
-        raise GnssError(f"{name}: line {line} is no fix: {t_s:g} s, {lat:g}, {lon:g}, sigma {sigma_m:g} m")
+        raise GnssError(f"{name}: line {line} is not a fix: {t_s:g} s, {lat:g}, {lon:g}, sigma {sigma_m:g} m")
     return t_s, lat, lon, sigma_m, speed
 
 
@@ -132,7 +132,7 @@ def _csv(text: str, name: str) -> list[_Fix]:
     head = [_NAMES.get(word, (word, 1.0))[0] for word in written]
     unit = {_NAMES[word][0]: _NAMES[word][1] for word in written if word in _NAMES}
     if not {"time_s", "latitude_deg", "longitude_deg"} <= set(head):
-        raise GnssError(f"{name}: its first line has to name the columns {COLUMNS}")
+        raise GnssError(f"{name}: its first line must name the columns {COLUMNS}")
     out = []
     for number, row in enumerate(rows[1:], start=2):
         if not row or row[0].lstrip().startswith("#"):
@@ -185,7 +185,7 @@ def _nmea(text: str, name: str, begin_ns: int) -> list[_Fix]:
 
 def _gpx(text: str, name: str) -> list[_Fix]:
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise GnssError(f"{name}: a GPX file with a DOCTYPE is not read")
+        raise GnssError(f"{name}: GPX with a DOCTYPE is not supported")
     try:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError, RecursionError) as error:

@@ -1,4 +1,4 @@
-"""NMEA 0183, sentence by sentence: RMC has the fix, GST or GGA of the same time its accuracy, before it or after it."""
+"""Reads NMEA 0183 sentences: RMC has the fix, GST or GGA of the same time its accuracy, before or after it."""
 
 from __future__ import annotations
 
@@ -16,20 +16,22 @@ Sentence = tuple[float, float, float, float, float | None]  # UTC in s, latitude
 
 
 class NmeaReader:
-    """`take` each line; a fix comes once the next one begins, `finish` has the last."""
+    """`take` each line; it returns a fix at the start of the next one, `finish` the last fix."""
 
     def __init__(self) -> None:
-        self._waiting: tuple[str, float, float, float, float | None] | None = None  # the time as it was sent, then ...
-        self._accuracy: dict[str, float] = {}  # by the time as it was sent
+        self._waiting: tuple[str, float, float, float, float | None] | None = None  # time as text, then ...
+        self._accuracy: dict[str, float] = {}  # by time as text
 
     @property
     def waits(self) -> str:
-        """The time, as it was sent, of the fix at hand; "": there is none."""
+        """The time of the current fix as text; "": none."""
         return "" if self._waiting is None else self._waiting[0]
 
     def take(self, line: str) -> Sentence | None:
-        """The fix before this line's, where this line begins another. Raises ValueError for one with a right sum and no
-        numbers; what has no right sum is passed over, since receivers cut lines off.
+        """Returns the previous fix if this line starts another.
+
+        Raises ValueError for a line with a valid checksum and invalid numbers; skips lines with a wrong checksum, since
+        receivers truncate lines.
         """
         words = _words(line)
         if words is None or len(words[0]) < 5:
@@ -48,7 +50,7 @@ class NmeaReader:
         return None
 
     def finish(self) -> Sentence | None:
-        """The fix that waits for its accuracy."""
+        """Returns the current fix with its accuracy."""
         if self._waiting is None:
             return None
         time_text, utc_s, latitude_deg, longitude_deg, speed_mps = self._waiting
@@ -81,7 +83,7 @@ def undated_fixes(lines: Iterable[str], near_s: float) -> Iterator[tuple[int, Se
 
 
 def _words(line: str) -> list[str] | None:
-    """Of a sentence whose sum is right."""
+    """Returns the words of a sentence with a valid checksum, else None."""
     body, star, checksum = line.strip().partition("*")
     if not body.startswith("$") or not star:
         return None
@@ -103,7 +105,7 @@ def _utc(date: str, time: str) -> float:
 
 
 def _degrees(word: str, side: str) -> float:
-    """ddmm.mmmm and its hemisphere."""
+    """Converts ddmm.mmmm with its hemisphere to degrees."""
     number = float(word)
     if not math.isfinite(number):
         raise ValueError(f"{word} is no angle")
