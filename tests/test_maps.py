@@ -433,8 +433,8 @@ def test_what_is_no_whole_map_is_refused(mapped: bytes) -> None:
     for data, why in (
         (b"", "empty"),
         (b"PNG", "no map"),
-        (mapped[:16], "cut off"),
-        (mapped[:-100], "torn"),
+        (mapped[:16], "truncated in its header"),
+        (mapped[:-100], "is truncated"),
         (bytes(flipped), "CRC"),
         (newer, "version 5"),
         (MAGIC + HEAD.pack(version, 1, zlib.crc32(b"\xc1")) + b"\xc1", "has an invalid body"),

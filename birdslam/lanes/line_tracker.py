@@ -25,28 +25,27 @@ from birdslam.lanes.tracked_lines import LEFT_EDGE, PAINT, RIGHT_EDGE, Track, Tr
 from birdslam.perception import Segmentation
 from birdslam.types import LaneLine
 
-MOVED_M = 0.8  # travelled between two updates: an image from the same place has the same errors
-STANDING_UPDATES = 4  # of a car that has not moved yet
+MOVED_M = 0.8  # min. distance travelled between two updates; images from one place have common errors
+STATIONARY_UPDATES = 4  # max. number of updates of a stationary car
 MIN_PAINT_M, MIN_EDGE_M = 2.4, 8.0  # evidence of a new line
-CERTAIN_M = 5.0  # ... that needs no second image
-APART_M = 0.45  # from a known line
-EDGE_WEIGHT = 0.3  # of an edge's points in the search: side roads and kerbstones bend a mask's border
+CERTAIN_M = 5.0  # evidence that confirms a line in one image
+APART_M = 0.45  # min. distance from a known line
+EDGE_WEIGHT = 0.3  # of an edge's points in the search, since side roads disturb a mask's border
 MAX_LINES = 9
-IN_VIEW_M = 8.0  # of a line that nothing hides: paint that is there would be seen
+IN_VIEW_M = 8.0  # visible length of a line in which paint would be detected
 CONFIRMED, MAX_SCORE = 3.0, 8.0
-SEEN_M = 2.0  # of paint: an image has the line
-SAME_M = 0.3  # two lines nearer than this along all of 5 to 20 m are one
-FORGOTTEN_M = -2.0  # a line that ended so far behind the ego is dropped
-NEAR_M, FAR_M = 5.0, 25.0  # where a line that is there has to be seen
-# Two lines nearer than this anywhere there bound no lane: one whose paint an image lacks gives way to one whose paint
-# it has, this factor faster as where it is alone
-NARROW_M, GIVES_WAY = 1.5, 3.0
-PAST_EDGE_M, MAX_ROAD_PAST = 0.8, 0.35  # so far past an edge there is no road along so much of it
-MIN_EXISTENCE, LOOKS_OF_A_SCRAP = 0.4, 4.0  # what has less after so many images is dropped
-AFRESH_M = 10.0  # travelled, as it were, before an image without a past
-# Lines are lost where less than this share of so much paint lies on them, and a search explains so much more of it
-LOST_M, LOST_SHARE, BETTER = 5.0, 0.5, 1.5
-PROFILE_M = 4.0, 22.0  # where paint and gaps are resolved
+SEEN_M = 2.0  # of paint, for a detection of the line
+SAME_M = 0.3  # max. distance of two tracks of one line, from 5 to 20 m
+FORGOTTEN_M = -2.0  # end of a line behind the ego at which it is dropped
+NEAR_M, FAR_M = 5.0, 25.0  # range in which a line is tested
+# Lines closer than NARROW_M bound no lane: the score of one without paint decreases faster by this factor
+NARROW_M, CONTESTED_COST = 1.5, 3.0
+PAST_EDGE_M, MAX_ROAD_PAST = 0.8, 0.35  # distance past an edge, max. share of road there
+MIN_EXISTENCE, MIN_IMAGES = 0.4, 4.0  # a line with a lower existence after MIN_IMAGES is dropped
+RESTART_M = 10.0  # distance travelled assumed for the first image
+# The lines are lost if they explain less than LOST_RATIO of the paint, and a new search BETTER_RATIO times as much
+LOST_M, LOST_RATIO, BETTER_RATIO = 5.0, 0.5, 1.5
+PROFILE_M = 4.0, 22.0  # range in which paint and gaps are resolved
 
 
 class LineTracker:
@@ -55,7 +54,7 @@ class LineTracker:
     def __init__(
         self, camera: Camera, certain_m: float = CERTAIN_M, yield_core: Callable[[], object] = lambda: None
     ) -> None:
-        """`certain_m` metres of evidence make a line sure in its first image.
+        """`certain_m`: evidence that confirms a line in its first image.
 
         `yield_core` is called between the parts of an update (lane_mapper.LaneHead).
         """
@@ -66,7 +65,7 @@ class LineTracker:
         self.clear()
 
     def clear(self) -> None:
-        """All lines are dropped; ids go on counting."""
+        """Drops all lines; ids are not reused."""
         self._filter = LineFilter()
         self._tracks: list[Track] = []
         self._T_world_filter: SE2 | None = None
@@ -113,9 +112,9 @@ class LineTracker:
             self._yield_core()
             shape, found = self._search(view, paint, 0.0)
             before = _explained_m(paint, self._tracks, seen)
-            if sum(peak.evidence_m for kind, peak in found if kind == PAINT) > BETTER * before:
+            if sum(peak.evidence_m for kind, peak in found if kind == PAINT) > BETTER_RATIO * before:
                 self._begin(shape, found)
-                points, of, seen = self._correct(view, paint, sigma_pitch_rad, AFRESH_M, 0.0, search_tilt)
+                points, of, seen = self._correct(view, paint, sigma_pitch_rad, RESTART_M, 0.0, search_tilt)
         if not self._filter.sound().all():
             self._keep_sound()
             return
@@ -128,12 +127,12 @@ class LineTracker:
         """Moves the filter to the ego; the distance since its last update, None where it is too short for another."""
         if self._T_world_filter is None:
             self._T_world_filter = T_world_ego
-            return AFRESH_M
+            return RESTART_M
         step = self._T_world_filter.between(T_world_ego)
         distance = float(np.hypot(step.x_m, step.y_m))
         if distance < MOVED_M:
             self._standing += 1
-            return None if self._standing > STANDING_UPDATES else MOVED_M
+            return None if self._standing > STATIONARY_UPDATES else MOVED_M
         self._standing = 0
         self._filter.predict(step)
         self._T_world_filter = T_world_ego
@@ -144,7 +143,7 @@ class LineTracker:
         return distance
 
     def _keep_sound(self) -> None:
-        """Drops lines that a wrong motion has carried off."""
+        """Drops lines with an implausible state."""
         kept = np.flatnonzero(self._filter.sound())
         if len(kept) < len(self._tracks):
             self._filter.keep(kept)
@@ -153,7 +152,7 @@ class LineTracker:
     def _search(
         self, view: RoadView, paint: LinePoints, sigma_tilt_rad: float
     ) -> tuple[Shape | None, list[tuple[int, Peak]]]:
-        """The lines of an image without a past, each with its class, and the shape that they share."""
+        """Returns the lines of the first image with their classes, and their common shape."""
         left, right = edge_points(view, np.zeros(len(view.x_m)))
         edges = (replace(edge, weight=EDGE_WEIGHT * edge.weight) for edge in (left, right))
         shape = find_shape(_joined(paint, *edges), self._height_m, sigma_tilt_rad)
@@ -173,7 +172,7 @@ class LineTracker:
         return shape, found
 
     def _begin(self, shape: Shape | None, found: list[tuple[int, Peak]]) -> float:
-        """Only these lines; gives the tilt that was found with them."""
+        """Restarts the filter with these lines; returns their tilt."""
         self._tracks = [Track(kind, score=1.0) for kind, _ in found]
         if shape is None:
             self._filter = LineFilter()
@@ -209,7 +208,7 @@ class LineTracker:
         Where vehicles hide all of them, the paint beside is another line's and says nothing of theirs.
         """
         near_m = float(paint.weight[paint.masked & (paint.x_m < SEARCHED_M)].sum())
-        if near_m <= LOST_M or _explained_m(paint, self._tracks, seen) >= LOST_SHARE * near_m:
+        if near_m <= LOST_M or _explained_m(paint, self._tracks, seen) >= LOST_RATIO * near_m:
             return False
         there = (view.x_m > NEAR_M) & (view.x_m < SEARCHED_M)
         painted = [k for k, track in enumerate(self._tracks) if track.kind == PAINT]
@@ -225,11 +224,11 @@ class LineTracker:
         return _joined(paint, left, right), of
 
     def _reference(self) -> int:
-        """The line that is known best."""
+        """Returns the line with the smallest covariance."""
         return int(np.argmin([self._filter.across_sigma_m(k, np.array([15.0]))[0] for k in range(len(self._tracks))]))
 
     def _judge(self, view: RoadView, points: LinePoints, seen: list[Support]) -> None:
-        """Which lines were seen, over which range, how much of them is paint."""
+        """Updates the scores of the lines, their ranges and their share of paint."""
         contested = self._contested(points, seen)
         for k, (track, support) in enumerate(zip(self._tracks, seen, strict=True)):
             x, rows = view.x_m, np.arange(len(view.x_m))
@@ -254,7 +253,7 @@ class LineTracker:
                 )
                 track.seen_to_m = max(track.seen_to_m, float(np.quantile(mine.x_m, 0.98)))
             elif visible_m > IN_VIEW_M:
-                track.score -= GIVES_WAY if k in contested else 1.0
+                track.score -= CONTESTED_COST if k in contested else 1.0
             near = (x > PROFILE_M[0]) & (x < PROFILE_M[1]) & clear
             length_m = float(view.row_m[near].sum())
             if length_m > 6.0 and track.kind == PAINT:
@@ -299,7 +298,7 @@ class LineTracker:
         }
 
     def _add_lines(self, points: LinePoints, of: Ints, seen: list[Support], height_m: float) -> None:
-        """Lines of points that lie on none that is known."""
+        """Adds lines from points on no known line."""
         free = np.ones(len(points), bool)
         for support in seen:
             free[support.points] = False
@@ -321,13 +320,13 @@ class LineTracker:
                 self._tracks.append(Track(kind, score=1.0))
 
     def _drop_lines(self) -> None:
-        """Lines that are no more seen, have ended behind the ego, or lie on another."""
+        """Drops lines that are no longer seen, end behind the ego, or coincide with another."""
         kept: list[int] = []
         x = np.array([5.0, 12.0, 20.0])
         ys = self._filter.curves @ basis(x).T
         for k in sorted(range(len(self._tracks)), key=lambda k: -self._tracks[k].score):
             track = self._tracks[k]
-            if track.looks >= LOOKS_OF_A_SCRAP and existence_of(track) < MIN_EXISTENCE:
+            if track.looks >= MIN_IMAGES and existence_of(track) < MIN_EXISTENCE:
                 continue
             if track.score <= 0.0 or (track.looks and track.seen_to_m < FORGOTTEN_M):
                 continue
@@ -342,7 +341,7 @@ class LineTracker:
                 track.line, self._next = self._next, self._next + 1
 
     def lines(self) -> TrackedLines:
-        """The lines that are sure, as they are after the last update; nothing changes them any more."""
+        """Returns a copy of the confirmed lines after the last update."""
         sure = [k for k, track in enumerate(self._tracks) if track.line >= 0]
         return TrackedLines(
             self._T_world_filter or SE2(),
