@@ -228,9 +228,7 @@ def test_install_start_break_and_remove(machine: Machine) -> None:
     machine.write("/etc/systemd/system/birdslam.service.d/limit.conf", "[Unit]\nStartLimitBurst=3\n")
     machine("systemctl", "daemon-reload")
     assert machine("sh", "-c", "systemctl start birdslam 2>/dev/null || echo failed") == "failed"
-    assert "birdslam: /etc/birdslam/vehicle.toml: no_such_key: no such key" in machine.journal(
-        "-u", "birdslam"
-    )
+    assert "birdslam: /etc/birdslam/vehicle.toml: no_such_key: no such key" in machine.journal("-u", "birdslam")
     machine.until(lambda: machine("systemctl", "is-failed", "birdslam", check=False) == "failed", "it is given up")
     machine("rm", "/etc/systemd/system/birdslam.service.d/limit.conf")
     machine("systemctl", "daemon-reload")

@@ -584,6 +584,8 @@ def test_while_the_router_is_gone_frames_say_so_and_then_images_come_again(tmp_p
         router.close()
         said = next(frame.error for frame in frames if frame.image is None)
         assert "no image for" in str(said)
-        until(lambda: "the router is not connected" in str(next(frames).error), "it does not say that the router is gone")
+        until(
+            lambda: "the router is not connected" in str(next(frames).error), "it does not say that the router is gone"
+        )
         stack.enter_context(peer("router", str(port)))
         until(lambda: next(frames).image is not None, "no image comes again")

@@ -196,9 +196,9 @@ def _kalibr(path: Path, tree: Mapping[str, Any]) -> Intrinsics:
     if model not in ("radtan", "equidistant", "none"):
         raise DatasetError(f"{path}: distortion_model {model} is not supported (only radtan, equidistant)")
     distortion = _numbers(path, camera, ("distortion_coeffs",)) or []
-    width, height = (_numbers(path, camera, ("resolution",)) or [None, None])[:2]
-    sizes = (None if side is None else int(side) for side in (width, height))
-    return _intrinsics(path, focal, distortion, model == "equidistant", *sizes)
+    size = _numbers(path, camera, ("resolution",))
+    width, height = (int(size[0]), int(size[1])) if size and len(size) == 2 else (None, None)
+    return _intrinsics(path, focal, distortion, model == "equidistant", width, height)
 
 
 def _orb_slam(path: Path, tree: Mapping[str, Any]) -> Intrinsics:
