@@ -384,7 +384,7 @@ def test_bad_input_is_one_line(data_dir: Path, tmp_path: Path, capsys: pytest.Ca
         (("/nowhere", "--output", out), "no such directory"),
         ((sequence, "--output", out, "--intrinsics", str(tmp_path / "lens.yaml")), "but the camera given is 640x480"),
         ((sequence, "--output", out, "--intrinsics", str(tmp_path / "no.yaml")), "no.yaml: can't be read"),
-        ((sequence, "--output", out, "--height", "nan"), "a camera is 0.2 to 5 m above the road"),
+        ((sequence, "--output", out, "--height", "nan"), "expected 0.2 to 5 m above the road"),
         ((sequence, "--output", out, "--speed", str(tmp_path / "speed.csv")), "lie outside the recording's"),
         ((sequence, "--output", out, "--speed", str(tmp_path / "torn.csv")), "torn.csv: line 2 is no time"),
         ((sequence, "--output", out, "--chessboard", str(tmp_path), "--board", "nine"), "expected COLSxROWS"),

@@ -142,7 +142,7 @@ def test_frames_that_cannot_be_compared_are_one_line(
     [
         (("--source", "demo", "--camera", "CAMERA", "--height", "1.4"), "the camera file has a height already"),
         (("--source", "v4l2:/dev/video9", "--height", "1.4"), "is live and has no first pass"),
-        (("--source", "video:FILM", "--height", "1.4", "--fov", "3"), "--fov 3: is no field of view"),
+        (("--source", "video:FILM", "--height", "1.4", "--fov", "3"), "--fov 3: expected a field of view"),
     ],
 )
 def test_a_first_pass_that_can_not_be_is_refused(

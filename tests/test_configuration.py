@@ -115,7 +115,7 @@ def test_a_camera_file_can_be_pinned(tmp_path: Path) -> None:
     pin = hashlib.sha256(path.read_bytes()).hexdigest()
     assert load(None, {"camera": str(path), "camera_sha256": pin}).camera is not None
     path.write_text(CAMERA.replace("1.5", "1.6"))
-    with pytest.raises(ConfigurationError, match=f"front.toml: its sha256 is .* camera_sha256 pins {pin}"):
+    with pytest.raises(ConfigurationError, match=f"front.toml: its sha256 is .* but camera_sha256 is {pin}"):
         load(None, {"camera": str(path), "camera_sha256": pin})
     with pytest.raises(ConfigurationError, match="there is no camera file"):
         load(None, {"camera_sha256": pin})

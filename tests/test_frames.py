@@ -166,7 +166,7 @@ def test_a_ring_cut_short_is_named(ring: FrameRing, reader: FrameReader) -> None
     cut = ring.path.read_bytes()[:-64]
     ring.path.unlink()  # not truncated in place: the writer still has it mapped
     ring.path.write_bytes(cut)
-    with pytest.raises(FrameError, match="does not fit"):
+    with pytest.raises(FrameError, match="does not match"):
         reader.read(ref_of(some_image(1), (0, 2), ring.epoch))
 
 

@@ -110,7 +110,7 @@ def test_fixes_without_sense_are_refused() -> None:
         )
         for fix in fixes_of(true, 1.5)
     ]
-    with pytest.raises(EarthError, match="fit the drive's way"):
+    with pytest.raises(EarthError, match="fit the trajectory"):
         tied(true, nodes, links, scattered)
 
 
@@ -333,7 +333,7 @@ def test_fixes_of_a_bag_bear_their_covariance(tmp_path: Path) -> None:
     fixes = recorded_fixes(configuration)
     assert fixes is not None
     assert [fix.sigma_m for fix in fixes(0).fixes] == [5.0, 2.0, 2.0]
-    with pytest.raises(ConfigurationError, match="no ROS bag"):
+    with pytest.raises(ConfigurationError, match="not a ROS bag"):
         recorded_fixes(load(None, {"source.uri": "demo", "results.gnss": "topic:/gps/fix"}))
 
 

@@ -506,7 +506,7 @@ with Inference(configuration) as inference:
     before = heap_kib()
     for frame in offline_frames(source):
         frontend.measure(frame, inference.start(frame))
-        inference.over()
+        inference.finish_frame()
     print(heap_kib() - before)
 """
 

@@ -97,9 +97,9 @@ def test_a_frame_waits_no_longer_than_what_comes_after_leaves_of_its_budget(
         for frame_id in range(2):  # the front end takes 1 s after the first: that is past any budget
             networks.start(Frame(frame_id, 0, clock_ns[0], 0, IMAGE)).result()
             clock_ns[0] += 10**9
-            networks.over()
+            networks.finish_frame()
         networks.start(Frame(9, 0, clock_ns[0], 0, None, (Status.FRAME_UNREADABLE,)))
-        networks.over()  # nothing was waited for: it says nothing
+        networks.finish_frame()  # nothing was waited for: it says nothing
     assert waited_s == [0.1, 0.0]
 
 
@@ -117,13 +117,13 @@ def test_rate_max_awaits_all(made: Made) -> None:
 def test_what_runs_aside_begins_when_its_frame_is_over(made: Made) -> None:
     detector, segmenter = Gated("detector"), Gated("segmenter")
     with made(detector, segmenter, 1.0) as networks:
-        aside = networks.aside
+        aside = networks.run_in_background
         assert aside is not None
         networks.start(frame(0))
         begun = threading.Event()
         future = aside(begun.set)
         assert not begun.wait(0.05)
-        networks.over()
+        networks.finish_frame()
         future.result(timeout=60.0)
         assert begun.is_set()
         networks.start(frame(1))
@@ -140,17 +140,17 @@ def test_what_runs_aside_lets_each_further_frame_pass(made: Made) -> None:
             networks.lane_head.yield_core()
             second.set()
 
-        aside = networks.aside
+        aside = networks.run_in_background
         assert aside is not None
         networks.start(frame(0))
         future = aside(lambda: (begun.wait(60.0), parts()))
         begun = threading.Event()
-        networks.over()
+        networks.finish_frame()
         networks.start(frame(1))  # comes while the first part is at work
         begun.set()
         assert first.wait(60.0)
         assert not second.wait(0.05)
-        networks.over()
+        networks.finish_frame()
         future.result(timeout=60.0)
         assert second.is_set()
 
@@ -158,6 +158,6 @@ def test_what_runs_aside_lets_each_further_frame_pass(made: Made) -> None:
 def test_at_rate_max_nothing_runs_aside(made: Made) -> None:
     detector, segmenter = Gated("detector"), Gated("segmenter")
     with made(detector, segmenter, 1.0, rate="max") as networks:
-        assert networks.aside is None
+        assert networks.run_in_background is None
         networks.start(frame(0))
         networks.lane_head.yield_core()  # at once: lanes are found within the frame

@@ -469,9 +469,9 @@ def test_a_run_refuses_what_it_can_not_use(mapped: bytes, tmp_path: Path) -> Non
     assert reads is not None
     assert len(reads.open(other)) > 20
     path.write_bytes(mapped[:-1])
-    with pytest.raises(MapError, match="torn"):
+    with pytest.raises(MapError, match="truncated"):
         writes.open(CAMERA)
-    with pytest.raises(ConfigurationError, match="name one"):
+    with pytest.raises(ConfigurationError, match="name only one"):
         MapChoice.of(load(None, {"results.map": "a", "results.map_only": "b"}))
     with pytest.raises(MapError, match="the folder does not exist"):
         MapChoice(tmp_path / "none" / "a.map", True).open(CAMERA)

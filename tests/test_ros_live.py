@@ -564,7 +564,7 @@ def test_images_that_were_lost_on_their_way_are_counted_by_their_numbers(
         finally:
             over.set()
             sender.join()
-    (said,) = (record.getMessage() for record in caplog.records if "lost on their way" in record.getMessage())
+    (said,) = (record.getMessage() for record in caplog.records if "lost in transit" in record.getMessage())
     came, lost = (int(word) for word in said.replace(":", " ").split() if word.isdecimal())
     assert came >= 5
     assert lost == 2 * (came - 1)

@@ -531,7 +531,7 @@ def test_certificates_are_kept_and_made_only_by_the_authority(certificates: Path
         (
             'messages: ["put"],\n        key_exprs: ["birdslam/*/v1/speed"',
             'messages: ["put"], key_exprs: ["**"',
-            "put in",
+            "allows put",
         ),
         ('flows: ["ingress"],\n        messages: ["put"]', 'messages: ["put", "delete"]', "allows delete, put"),
         ("adminspace: {", "adminspaced: {", "gate.json5"),

@@ -136,7 +136,7 @@ def test_a_speed_file_is_asked_for_by_the_configuration(tmp_path: Path) -> None:
 def test_several_drives_have_a_file_each(tmp_path: Path) -> None:
     asked = Configuration(source=SourceConfig(speed=str(file(tmp_path, "0 1\n"))))
     assert speeds_of(asked, 1) == tmp_path / "speed.csv"
-    with pytest.raises(ConfigurationError, match=r"for 2 give a directory of their NAME\.txt"):
+    with pytest.raises(ConfigurationError, match=r"for 2 name a directory of NAME\.txt files"):
         speeds_of(asked, 2)
     assert speeds_of(Configuration(source=SourceConfig(speed=str(tmp_path))), 2) == tmp_path
     assert of_sequence(tmp_path, "06") == tmp_path / "06.txt"
