@@ -296,7 +296,7 @@ def test_a_file_of_another_drive_is_refused(tmp_path: Path, seen: Seen) -> None:
         check_detections(seen.recording, path)
     path.write_text("1,-1,9000,20,30,40,0.9\n1,-1,-10,20,30,40,0.9\n")
     assert check_detections(seen.recording, path).endswith("2 boxes, 2 of car; 1 outside of the image are dropped")
-    with pytest.raises(ConfigurationError, match="remove source.loop"):
+    with pytest.raises(ConfigurationError, match=r"remove source\.loop"):
         open_source(load(None, {"source.uri": "demo", "source.loop": True, "source.detections": str(path)}))
     assert Configuration().source.detections == ""
 

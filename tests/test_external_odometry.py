@@ -212,7 +212,7 @@ def test_the_configuration_says_which_odometry_it_is(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="12 poses for"):
         open_source(configuration)
     looped = Configuration(source=SourceConfig(uri="demo", odometry=str(path), loop=True))
-    with pytest.raises(ConfigurationError, match="remove source.loop"):
+    with pytest.raises(ConfigurationError, match=r"remove source\.loop"):
         open_source(looped)
     live = Configuration(source=SourceConfig(uri="v4l2:/dev/video0", odometry=str(path)), camera=CAMERA)
     with pytest.raises(ConfigurationError, match="for recordings"):

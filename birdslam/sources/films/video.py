@@ -151,7 +151,7 @@ class VideoRecording(Recording):
                     is_last = followed and position >= film.declared - tail.maxlen  # type: ignore[operator]
                     ok, image = capture.retrieve() if index >= start or is_last else (False, None)
                     if ok and is_last and image is not None:
-                        tail.append(_small(image))
+                        tail.append(_small(np.asarray(image, np.uint8)))
                     if ok and image is not None and square != (image.shape[1], image.shape[0]):
                         image = cv2.resize(image, square, interpolation=cv2.INTER_LINEAR)
                     error = None if ok else f"{film.path}: frame {position} can't be decoded"
