@@ -365,6 +365,15 @@ def test_films_that_overlap_are_one_drive_without_a_frame_twice(tmp_path: Path, 
     assert [(frame.index, frame.t_source_ns) for frame in later] == [(f.index, f.t_source_ns) for f in seen[150:]]
 
 
+def test_the_overlap_of_films_is_cut_whatever_the_stride(tmp_path: Path) -> None:
+    moving_film(tmp_path / "a_001.mp4", range(120))
+    moving_film(tmp_path / "a_002.mp4", range(90, 200), quality="30")
+    recording = open_recording(f"video:{tmp_path}", WIDE, 3)
+    steps_s = np.diff([frame.t_source_ns for frame in recording.frames()]) / 1e9
+    assert steps_s.sum() == pytest.approx(199 / 30.0, abs=0.11)
+    np.testing.assert_allclose(steps_s, 0.1, atol=0.07)
+
+
 def test_films_of_a_stationary_camera_are_not_cut(tmp_path: Path) -> None:
     moving_film(tmp_path / "a_001.mp4", [5] * 60)
     moving_film(tmp_path / "a_002.mp4", [5] * 60)

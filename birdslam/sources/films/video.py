@@ -147,11 +147,12 @@ class VideoRecording(Recording):
                     words = f"{film.path}: {gap_ns / NS_PER_S:.1f} s are missing before frame {position}"
                     yield RecordedFrame(index, t_ns - film.period_ns // 2, None, words)
                     index += 1
-                if position % self._stride == 0:
-                    is_last = followed and position >= film.declared - tail.maxlen  # type: ignore[operator]
-                    ok, image = capture.retrieve() if index >= start or is_last else (False, None)
-                    if ok and is_last and image is not None:
-                        tail.append(_small(np.asarray(image, np.uint8)))
+                is_taken = position % self._stride == 0
+                is_last = followed and position >= film.declared - tail.maxlen  # type: ignore[operator]
+                ok, image = capture.retrieve() if is_last or (is_taken and index >= start) else (False, None)
+                if ok and is_last and image is not None:
+                    tail.append(_small(np.asarray(image, np.uint8)))
+                if is_taken:
                     if ok and image is not None and square != (image.shape[1], image.shape[0]):
                         image = cv2.resize(image, square, interpolation=cv2.INTER_LINEAR)
                     error = None if ok else f"{film.path}: frame {position} can't be decoded"
