@@ -8,12 +8,32 @@ from typing import Any
 
 from birdslam.runtime.configuration import NO_MODEL, Configuration, ConfigurationError, load, parse_setting
 from birdslam.runtime.models import store as model_store
+from birdslam.runtime.schemes import all_schemes
+from birdslam.sources.schemes import uri_of
 
 
 def configuration_of(options: argparse.Namespace) -> Configuration:
     """Loads the configuration file, overridden by the options of the command line. Raises ConfigurationError."""
+    take_inputs(options)
     overrides, named = overrides_of(options)
     return load(options.config, overrides, named, constants_of(options))
+
+
+def take_inputs(options: argparse.Namespace) -> None:
+    """Sets `config` and `source` from the positional arguments of `birdslam run`. Raises ConfigurationError."""
+    for text in getattr(options, "inputs", ()):
+        if Path(text).suffix.lower() == ".toml":
+            if options.config is not None:
+                raise ConfigurationError(f"{text}: there is a configuration file already, {options.config}")
+            options.config = Path(text)
+        elif options.source is not None:
+            raise ConfigurationError(f"{text}: there is a source already, {options.source}")
+        else:
+            try:
+                options.source = uri_of(text, all_schemes())
+            except ValueError as error:
+                raise ConfigurationError(str(error)) from None
+    options.inputs = ()
 
 
 def constants_of(options: argparse.Namespace) -> dict[str, Any]:

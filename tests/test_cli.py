@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -166,3 +167,70 @@ def test_a_first_pass_that_can_not_be_is_refused(
     given = [places.get(word, word) for word in options]
     assert main(["run", *given, "--output", str(tmp_path / "out")]) == 2
     assert reason in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "source"),
+    [
+        (["video:film.mp4"], "video:film.mp4"),
+        (["film.mp4"], "video:film.mp4"),
+        (["run", "film.mp4", "--stride", "2"], "video:film.mp4"),
+        (["run", "car.toml", "film.mp4"], "video:film.mp4"),
+        (["drive.bag"], "rosbag:drive.bag"),
+        (["parts"], "video:parts"),
+        (["demo"], "demo"),
+    ],
+)
+def test_a_path_is_a_source_of_its_kind(
+    arguments: list[str], source: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("film.mp4", "drive.bag", "car.toml"):
+        (tmp_path / name).touch()
+    (tmp_path / "parts").mkdir()
+    options = parse(arguments)
+    assert options.command == "run"
+    assert configuration_of(options).source.uri == source
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["film.mp4"], "film.mp4: there is no such file"),
+        (["run", "notes.txt"], "notes.txt: not recognized; name its kind: demo"),
+        (["run", "demo", "demo:there"], "demo:there: there is a source already, demo"),
+        (["run", "demo", "--source", "demo:there"], "demo: there is a source already, demo:there"),
+        (["run", "a.toml", "b.toml"], "b.toml: there is a configuration file already, a.toml"),
+    ],
+)
+def test_a_path_that_is_no_source_is_refused(
+    arguments: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "notes.txt").touch()
+    assert main(arguments) == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize(
+    ("line", "offered"),
+    [
+        ("birdslam cal", "calibrate "),
+        ("birdslam run --hei", "--height "),
+        ("birdslam map exp", "export "),
+        ("birdslam run --kind ", "dashcam phone"),
+    ],
+)
+def test_the_shell_completes(line: str, offered: str, tmp_path: Path) -> None:
+    pytest.importorskip("argcomplete")
+    answer = tmp_path / "answer"
+    asked = {"COMP_LINE": line, "COMP_POINT": str(len(line)), "_ARGCOMPLETE": "1", "_ARGCOMPLETE_IFS": " "}
+    asked["_ARGCOMPLETE_STDOUT_FILENAME"] = str(answer)
+    command = [sys.executable, "-m", "birdslam.runtime.cli.main"]
+    subprocess.run(command, env={**os.environ, **asked}, check=False, timeout=60)
+    assert answer.read_text().split() == offered.split()

@@ -8,7 +8,7 @@ from birdslam.geometry.camera import Camera
 from birdslam.ros.bag import BagTopics
 from birdslam.sources import schemes
 from birdslam.sources.recording import DatasetError, Recording
-from birdslam.sources.schemes import Scheme, parse
+from birdslam.sources.schemes import Scheme, parse, uri_of
 from birdslam.sources.speed_file import with_speeds
 
 
@@ -19,7 +19,7 @@ def open_recording(
     speeds: Path | None = None,
     topics: BagTopics = BagTopics(),  # noqa: B008
 ) -> Recording:
-    """Open every `stride`-th frame of a recording by its URI: `video:FILE`, or any other of `schemes.RECORDED`.
+    """Opens every `stride`-th frame of a recording, given its path or its URI (`video:FILE`; `schemes.RECORDED`).
 
     `camera` replaces the recording's own calibration. `speeds` is a file of the car's own speed over the drive
     (sources/speed_file.py). `topics` says which of a ROS bag are read.
@@ -27,7 +27,7 @@ def open_recording(
     Raises DatasetError where it can't be used.
     """
     try:
-        scheme, address = parse(uri, schemes.RECORDED)
+        scheme, address = parse(uri_of(uri, schemes.RECORDED), schemes.RECORDED)
     except ValueError as error:
         raise DatasetError(str(error)) from None
     return open_address(scheme, address, camera, stride, speeds, topics)

@@ -138,3 +138,17 @@ def scheme_at(path: Path, schemes: Sequence[Scheme]) -> Scheme | None:
 def by_suffix(path: Path, schemes: Sequence[Scheme]) -> Scheme | None:
     """By a file's name alone."""
     return next((scheme for scheme in schemes if path.suffix.lower() in scheme.suffixes), None)
+
+
+def uri_of(text: str, schemes: Sequence[Scheme]) -> str:
+    """Returns the URI of a source, given a URI or the path of a recording. Raises ValueError with the known schemes."""
+    if scheme_of(text, schemes) is not None:
+        return text
+    path = Path(text).expanduser()
+    if not path.exists():
+        raise ValueError(f"{text}: there is no such file, and no such source; expected a path or {written(schemes)}")
+    found = scheme_at(path, schemes) or (VIDEO if path.is_dir() else None)
+    if found is None:
+        kinds = [scheme for scheme in schemes if scheme.address == "path" and not scheme.live]
+        raise ValueError(f"{text}: not recognized; name its kind: {written(kinds)}")
+    return f"{found.name}:{text}"

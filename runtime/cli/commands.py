@@ -7,13 +7,17 @@ the exit status. It is imported only when it runs, so that `--help` is fast. Thi
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import version
+from pathlib import Path
 
 from birdslam.runtime.schemes import all_schemes
-from birdslam.sources.schemes import written
+from birdslam.sources.schemes import scheme_of, written
+
+COMPLETING = "_ARGCOMPLETE"  # argcomplete's variable of the environment
 
 
 @dataclass(frozen=True)
@@ -43,7 +47,8 @@ GROUPS = {
 COMMANDS = (
     Command("run", "run capture, perceive and optimize on a source", "vehicle.run"),
     Command("replay", "run the back end on a recording and compare it bit for bit", "drives.replay"),
-    Command("export", "export a recording as a ROS 2 bag (pip install birdslam[ros])", "drives.export"),
+    Command("export", "export a drive for COLMAP, nerfstudio, TUM, KITTI, GeoJSON; a recording for ROS 2",
+            "drives.export"),
     Command("report", "write one HTML page of a drive (pip install birdslam[report])", "drives.report"),
     Command("view", "show a recording or a running vehicle in rerun (pip install birdslam[view])", "drives.view"),
     Command("top", "show a live table of the nodes: rates, ages, budgets, restarts", "vehicle.top"),
@@ -69,6 +74,8 @@ COMMANDS = (
     Command("calibrate",
             "estimate a camera file from a drive: intrinsics, pitch, roll; checks the height",
             "drives.calibrate"),
+    Command("completion", "print the completion of a shell: bash, zsh, fish (pip install birdslam[completion])",
+            "completion"),
     Command("models list", "list shipped, installed and known networks", "models", "list_models", "add_directory"),
     Command("models check", "compare a manifest with its network's inputs and outputs, by one test run",
             "models", "check", "add_check_arguments"),
@@ -102,6 +109,13 @@ def sources_note() -> str:
     return f"Sources: {written(all_schemes())}."
 
 
+def _is_source(text: str) -> bool:
+    """Whether the first argument is no command but the source of `birdslam run`."""
+    if text.startswith("-") or any(text == command.words.split()[0] for command in COMMANDS):
+        return False
+    return scheme_of(text, all_schemes()) is not None or "." in text or Path(text).expanduser().exists()
+
+
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
     """Parses the arguments; `call` of the result is the function that takes it.
 
@@ -111,6 +125,10 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
         prog="birdslam", description="Monocular multibody SLAM in bird's-eye view.", epilog=sources_note()
     )
     parser.add_argument("--version", action="version", version=f"birdslam {version('birdslam')}")
+    if COMPLETING in os.environ:  # the shell asks for the words that can follow
+        arguments = os.environ["COMP_LINE"].split()[1:]
+    elif arguments and _is_source(arguments[0]):
+        arguments = ["run", *arguments]
     groups = {"": parser.add_subparsers(required=True, metavar="COMMAND")}
     for command in COMMANDS:
         group, _, name = command.words.rpartition(" ")
@@ -121,4 +139,8 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
         words = command.words.split()
         if [*arguments[: len(words)]] == words:
             command.load(own)
+    if COMPLETING in os.environ:
+        import argcomplete
+
+        argcomplete.autocomplete(parser)
     return parser.parse_args(arguments)

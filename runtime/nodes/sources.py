@@ -20,7 +20,7 @@ from birdslam.sources.detection_file import check_detections
 from birdslam.sources.odometry_file import check_odometry
 from birdslam.sources.opening import open_address
 from birdslam.sources.recording import RecordedFrame, Recording, undistorted
-from birdslam.sources.schemes import KITTI, Scheme, parse, scheme_of, written
+from birdslam.sources.schemes import KITTI, Scheme, parse, scheme_at, scheme_of, written
 from birdslam.sources.speed_file import of_sequence
 from birdslam.sources.speed_log import shifted
 from birdslam.types import Frame, Status
@@ -73,12 +73,13 @@ def open_source(configuration: Configuration, must_open: bool = True) -> Source:
 
 
 def recording_uri(text: str) -> str:
-    """Returns the URI of a recording, given a URI or the path of a KITTI directory.
+    """Returns the URI of a recording, given a URI or a path; a directory of no other kind is KITTI's.
 
     Raises ConfigurationError for a live camera and for an unknown scheme.
     """
     if scheme_of(text, all_schemes()) is None and (":" not in text or Path(text).expanduser().exists()):
-        return f"{KITTI.name}:{text}"
+        found = scheme_at(Path(text).expanduser(), all_schemes()) or KITTI
+        return f"{found.name}:{text}"
     scheme, _ = parsed(text)
     if scheme.live:
         raise ConfigurationError(f"{text}: is a live camera; expected one of {written(recorded_schemes())}")

@@ -25,7 +25,7 @@ from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.models.download import DownloadError
 from birdslam.runtime.models.recommended import fetch, recommended
 from birdslam.runtime.models.store import models_directory
-from birdslam.runtime.options import configuration_of
+from birdslam.runtime.options import configuration_of, take_inputs
 from birdslam.runtime.schemes import all_schemes, is_live
 from birdslam.runtime.supervision.run import run as run_processes
 from birdslam.sources.schemes import VIDEO, scheme_of
@@ -34,9 +34,10 @@ from birdslam.sources.schemes import VIDEO, scheme_of
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds source, rate, recording, results and pipeline."""
     parser.epilog = sources_note()
-    text = "configuration file: differences from the defaults"
-    parser.add_argument("config", nargs="?", type=Path, metavar="CONFIG.toml", help=text)
-    parser.add_argument("--source", metavar="URI", help="source of the frames")
+    text = "a film, a recording or another source; or a configuration file: differences from the defaults"
+    parser.set_defaults(config=None)
+    parser.add_argument("inputs", nargs="*", metavar="SOURCE|CONFIG.toml", help=text)
+    parser.add_argument("--source", metavar="URI", help="source of the frames, in place of SOURCE")
     parser.add_argument("--rate", metavar="HZ|max", help='frames per second; "max": every frame, as fast as possible')
     parser.add_argument("--vehicle", metavar="NAME", help="name of the vehicle on the bus")
     parser.add_argument("--record", metavar="FILE.mcap", help="record the drive to a file; DIR: to a new file in it")
@@ -58,6 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Runs until the source ends and returns the exit status."""
+    take_inputs(options)
     lens = _lens_of_another_project(options)
     configuration = configuration_of(options)
     scheme = scheme_of(configuration.source.uri, all_schemes())

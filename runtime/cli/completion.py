@@ -1,0 +1,24 @@
+"""`birdslam completion SHELL`: what a shell evaluates to complete commands, options and files, by argcomplete."""
+
+from __future__ import annotations
+
+import argparse
+
+from birdslam.runtime.configuration import ConfigurationError
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the shell."""
+    parser.add_argument(
+        "shell", choices=("bash", "zsh", "fish"), help='in its start file: eval "$(birdslam completion bash)"'
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    """Prints the completion."""
+    try:
+        import argcomplete
+    except ImportError:
+        raise ConfigurationError("completion needs argcomplete: pip install birdslam[completion]") from None
+    print(argcomplete.shellcode(["birdslam"], shell=options.shell))
+    return 0
