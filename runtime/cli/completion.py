@@ -17,8 +17,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Prints the completion."""
     try:
-        import argcomplete
+        from argcomplete.shell_integration import shellcode
     except ImportError:
         raise ConfigurationError("completion needs argcomplete: pip install birdslam[completion]") from None
-    print(argcomplete.shellcode(["birdslam"], shell=options.shell))
+    print(shellcode(["birdslam"], shell=options.shell))
     return 0
