@@ -17,7 +17,7 @@ CORES := $(or $(shell nproc 2>/dev/null),2)
 unexport PYTHONDONTWRITEBYTECODE
 ON_EACH_CHANGE := not slow and not faults and not onroad
 
-.PHONY: picture setup lock newest browser test test-cpus test-cpus-sample test-slow pythons wheel-test index-test fuzz faults onroad perf lint types train demo demo-kitti clean
+.PHONY: picture setup lock newest browser exiftool test test-cpus test-cpus-sample test-slow pythons wheel-test index-test fuzz faults onroad perf lint types train demo demo-kitti clean
 
 setup: $(VENV)/.ready
 
@@ -48,8 +48,15 @@ browser:
 			&& apt-get update -q && apt-get install -qy --no-install-recommends chromium; } \
 		|| echo "no Chromium: tests of pages in a browser will skip (Debian, as root: apt-get install chromium)"
 
+# For the tests of GNSS tracks inside films
+exiftool:
+	@command -v exiftool >/dev/null \
+		|| { test "$$(id -u)" = 0 && command -v apt-get >/dev/null \
+			&& apt-get update -q && apt-get install -qy --no-install-recommends libimage-exiftool-perl; } \
+		|| echo "no ExifTool: tests of GNSS tracks in films will skip (Debian, as root: apt-get install libimage-exiftool-perl)"
+
 # First the tests that compute, one on each core; then those that start processes and wait for them, three at a time
-test: browser setup
+test: browser exiftool setup
 	@$(BIN)/python -m tests.run
 
 # The tests that compute under the kernels of other processors, or VARIANT="NAME,..."; perf/accuracy/cpus.py lists them

@@ -72,7 +72,8 @@ def add_map(parser: argparse.ArgumentParser) -> None:
     which.add_argument("--map-only", metavar="FILE", help="localize the drive in this map, do not change it")
     which.add_argument("--no-map", action="store_true", help="use no map, whatever the configuration names")
     text = (
-        "GNSS fixes: a file (CSV, NMEA, GPX), topic:/NAME of a ROS bag, or a receiver /dev/TTY[@BAUD]; "
+        "GNSS fixes: a file (CSV, NMEA, GPX), film (inside it), topic:/NAME of a ROS bag, or a receiver "
+        "/dev/TTY[@BAUD]; "
         "georeferences trajectory and map: ego.geojson, ego.gpx, ego.kml"
     )
     parser.add_argument("--gnss", metavar="FILE", help=text)

@@ -9,6 +9,7 @@ from pathlib import Path
 import msgspec
 
 from birdslam.calibration.camera_files import format_of
+from birdslam.loops.gnss.files import GnssError
 from birdslam.outputs.plain_words import LengthsBy
 from birdslam.perception import ModelError
 from birdslam.runtime.cli.arguments import (
@@ -22,12 +23,14 @@ from birdslam.runtime.cli.arguments import (
 )
 from birdslam.runtime.cli.commands import sources_note
 from birdslam.runtime.configuration import Configuration, ConfigurationError
+from birdslam.runtime.maps import film_gnss
 from birdslam.runtime.models.download import DownloadError
 from birdslam.runtime.models.recommended import fetch, recommended
 from birdslam.runtime.models.store import models_directory
 from birdslam.runtime.options import configuration_of, take_inputs
 from birdslam.runtime.schemes import all_schemes, is_live
 from birdslam.runtime.supervision.run import run as run_processes
+from birdslam.sources.films.container import films_in
 from birdslam.sources.schemes import VIDEO, scheme_of
 
 
@@ -44,7 +47,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--record-images", action="store_true", default=None, help="also record the frames, as JPEG")
     add_final_results(parser)
     add_map(parser)
-    text = "speed of the vehicle during a recording: time in s, speed in m/s, or a GPS table with named columns"
+    text = "speed of the vehicle during a recording: time in s, speed in m/s, or a GPS table with named columns; "
+    text += "film: the GNSS track inside the film"
     parser.add_argument("--speed", metavar="FILE", help=text)
     add_other_odometry(parser, "FILE")
     add_detections(parser)
@@ -66,6 +70,7 @@ def run(options: argparse.Namespace) -> int:
     if scheme is VIDEO and not options.model and not configuration.models.given() and configuration.models.shipped:
         options.model = list(_networks(configuration, options.yes))
         configuration = configuration_of(options)
+    configuration = _with_film_gnss(configuration)
     if options.height is None and lens is None and (scheme is not VIDEO or configuration.camera is not None):
         return run_processes(configuration)
     configuration, lengths_by = _calibrated(configuration, options, lens)
@@ -81,6 +86,40 @@ def _lens_of_another_project(options: argparse.Namespace) -> Path | None:
         return None
     path, options.camera = Path(options.camera), None
     return path
+
+
+def _with_film_gnss(configuration: Configuration) -> Configuration:
+    """Returns the configuration with the GNSS track inside a film, where it is named or no other is.
+
+    Raises ConfigurationError, DatasetError, GnssError.
+    """
+    source, results = configuration.source, configuration.results
+    named = film_gnss.FILM in (source.speed, results.gnss)
+    scheme, _, address = source.uri.partition(":")
+    if scheme != VIDEO.name:
+        if named:
+            raise ConfigurationError(f"--gnss film, --speed film: the source is no film: {source.uri}")
+        return configuration
+    if not named and (results.gnss or not film_gnss.is_readable()):
+        return configuration
+    track = Path(configuration.output) / film_gnss.TRACK_FILE
+    films = films_in(Path(address).expanduser(), VIDEO.suffixes)
+    try:
+        count = film_gnss.track_of_films(films, track)
+    except GnssError:
+        if named:
+            raise
+        return configuration  # a film that can't be read is reported when it is opened
+    if not count:
+        if named:
+            raise ConfigurationError(f"--gnss film, --speed film: {address}: has no GNSS track")
+        return configuration
+    print(f"{count} GNSS fixes inside the film: {track}", flush=True)
+    if source.speed == film_gnss.FILM:
+        source = msgspec.structs.replace(source, speed=str(track))
+    if results.gnss in ("", film_gnss.FILM):
+        results = msgspec.structs.replace(results, gnss=str(track))
+    return msgspec.structs.replace(configuration, source=source, results=results)
 
 
 def _networks(configuration: Configuration, fetch_them: bool) -> tuple[str, ...]:
