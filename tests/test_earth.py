@@ -18,7 +18,7 @@ from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.gnss.earth import Earth, EarthError, GnssFix, align_with_fixes
 from birdslam.loops.gnss.files import GnssError, read_fixes, read_track
-from birdslam.outputs.earth_files import Way, write_ways
+from birdslam.outputs.earth_files import GeoLine, write_geo_lines
 
 ORIGIN = 51.05, -114.05
 YAW_RAD = 0.7  # of the drive's x axis from east
@@ -231,9 +231,9 @@ def test_a_table_is_read_by_what_its_columns_mean(encoding: str) -> None:
 
 def test_the_files_are_valid_and_hold_the_way(tmp_path: Path) -> None:
     degrees = np.array([(51.0, -114.0), (51.1, -114.1), (51.2, -114.3)])
-    way = Way("ego & <more>", degrees, [0, 1_500_000_000, 3_000_000_000], {"rms_m": 1.5})
+    way = GeoLine("ego & <more>", degrees, [0, 1_500_000_000, 3_000_000_000], {"rms_m": 1.5})
     for suffix in (".geojson", ".gpx", ".kml"):
-        write_ways(tmp_path / f"way{suffix}", [way])
+        write_geo_lines(tmp_path / f"way{suffix}", [way])
     found = geojson.loads((tmp_path / "way.geojson").read_text())
     assert found.is_valid, found.errors()
     assert json.loads(geojson.dumps(found))["features"][0]["geometry"]["coordinates"][1] == [-114.1, 51.1]
@@ -242,7 +242,7 @@ def test_the_files_are_valid_and_hold_the_way(tmp_path: Path) -> None:
     assert [(p.latitude, p.longitude) for p in track.segments[0].points] == [tuple(row) for row in degrees]
     assert "-114.30000000,51.20000000" in (tmp_path / "way.kml").read_text()
     with pytest.raises(ValueError, match="is written as"):
-        write_ways(tmp_path / "way.shp", [way])
+        write_geo_lines(tmp_path / "way.shp", [way])
 
 
 def test_the_dashcams_own_fixes_are_read(data_dir: Path) -> None:

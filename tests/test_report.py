@@ -16,7 +16,7 @@ import pytest
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.outputs.drive_files import Recorder, ResultsError
-from birdslam.outputs.earth_files import Way, write_ways
+from birdslam.outputs.earth_files import GeoLine, write_geo_lines
 from birdslam.outputs.placed import Place, write_places
 from birdslam.outputs.report.drawings import speeds
 from birdslam.outputs.report.drive_table import read_drive
@@ -77,7 +77,7 @@ def results(tmp_path: Path) -> Path:
                 "age_ms": {"p50": 20.0, "p99": 32.0, "max": 40.0}, "earth": {"fixes": 9, "outliers": 1, "rms_m": 1.5},
             }
         )  # fmt: skip
-    write_ways(directory / "ego.geojson", [Way(EVIL, np.array([[49.0, 8.4], [49.001, 8.401]]))])
+    write_geo_lines(directory / "ego.geojson", [GeoLine(EVIL, np.array([[49.0, 8.4], [49.001, 8.401]]))])
     (directory / "camera.toml").write_text(f"# {EVIL}\n")
     return directory
 
@@ -153,7 +153,7 @@ def test_the_page_is_whole_offline_and_escaped(results: Path, capsys: pytest.Cap
     assert own.count('"jpeg":') == FRAMES
     for said in (
         "p50 4.0, p99 8.0 ms",
-        "in all",
+        "total",
         "p50 20.0, p99 32.0 ms",
         "49.000000, 8.400000",
         "RMS 1.5 m",
@@ -181,10 +181,10 @@ def test_what_is_no_drive_is_one_line(tmp_path: Path, results: Path, capsys: pyt
     assert main(["report", str(tmp_path / "empty")]) == 2
     assert "no results of `birdslam run`" in capsys.readouterr().err
     (results / "frames.csv").write_text("frame,t_s\n1,2\n")
-    with pytest.raises(ResultsError, match=r"frames\.csv: holds no frames"):
+    with pytest.raises(ResultsError, match=r"frames\.csv: has no frames"):
         read_drive(results)
     (results / "summary.json").write_text("{")
-    with pytest.raises(ResultsError, match="torn"):
+    with pytest.raises(ResultsError, match="damaged"):
         read_drive(results)
 
 

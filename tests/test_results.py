@@ -265,10 +265,10 @@ def test_only_a_vehicle_that_is_told_to_drive_is_drawn_so(moves: Moves) -> None:
         seen = (vehicle(1, SE2(15.0 + k, 3.5, 0.0), k + 1, 10.0, moves=moves),)
         recorder.add(estimate(k, SE2(1.0 * k, 0.0, 0.0), vehicles=seen))
     (track,) = recorder.scene(name="", path_m=0.0, frames=30, track_count=1).tracks
-    assert track.moving is (moves is Moves.DRIVING)
+    assert track.is_moving is (moves is Moves.DRIVING)
 
 
 @pytest.mark.parametrize(("way_m", "speed_mps", "moving"), [(30.0, 8.0, True), (5.0, 8.0, False), (30.0, 0.2, False)])
 def test_a_creeping_parked_car_is_not_drawn_as_moving(way_m: float, speed_mps: float, moving: bool) -> None:
     poses = np.column_stack([np.linspace(0.0, way_m, 30), np.zeros(30), np.zeros(30)])
-    assert Track(1, "car", 4.0, 1.7, poses, 30, speed_mps, farthest_m=40.0).moving is moving
+    assert Track(1, "car", 4.0, 1.7, poses, 30, speed_mps, farthest_m=40.0).is_moving is moving

@@ -1,1 +1,1 @@
-"""What a drive leaves on disk: trajectories, the map, a picture from above, a video. Read `drive_files` first."""
+"""The files of a drive: trajectories, map, bird's-eye picture, video. Start with `drive_files`."""

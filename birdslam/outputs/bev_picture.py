@@ -1,6 +1,6 @@
-"""The drive from above, as a PNG: the ego's way, the vehicles' tracks and the map, in metres, forward up.
+"""Draws a drive from above as a PNG: the ego trajectory, the tracks and the map, in metres.
 
-Points are in world (x forward, y left) of the first epoch; on paper x goes up and y to the left.
+Points are in world of the first epoch (x forward, y left). On paper, x points up and y points left.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from birdslam.geometry.arrays import Floats
 from birdslam.types import FIRST_PERSON, PEOPLE
 
 DPI = 160
-LONG_SIDE_IN = 9.0  # of the map itself
+LONG_SIDE_IN = 9.0  # of the map
 PANEL_IN = 2.9
 MARGIN_M = 6.0
-SHORT_TRACK_FRAMES = 5  # a track seen in fewer frames is mostly a false alarm: it is left out of the picture
-MOVING_SPEED_MPS, MOVING_WAY_M, MOVING_WAY_REL = 1.5, 3.0, 0.15  # a vehicle that does both moves, see Track.moving
-PEOPLE_SPEED_MPS, PEOPLE_WAY_M = 0.5, 1.0  # and a person
-LISTED_TRACKS = 22
+MIN_TRACK_FRAMES = 5  # a shorter track is mostly a false alarm
+MIN_MOVING_SPEED_MPS, MIN_MOVING_DISTANCE_M, DEPTH_CREEP_RATIO = 1.5, 3.0, 0.15  # see Track.is_moving
+MIN_PERSON_SPEED_MPS, MIN_PERSON_DISTANCE_M = 0.5, 1.0
+MAX_LISTED_TRACKS = 22
 LABEL_CHARACTERS = 12
-EGO_LENGTH_M, EGO_WIDTH_M, EGO_AXLE_M = 4.2, 1.8, 1.7  # how the ego is drawn, its nose EGO_AXLE_M before the camera
+EGO_LENGTH_M, EGO_WIDTH_M, EGO_FRONT_M = 4.2, 1.8, 1.7  # the ego symbol; its front is EGO_FRONT_M ahead of the camera
 
 PAPER, INK, FAINT, GRID = "#12161d", "#e8ebf0", "#8b95a5", "#232a35"
 EGO, LANE, LANDMARK, BREAK, SAMPLE = "#35d0ff", "#f3ecd2", "#5f6b7c", "#ff5d5d", "#c3cad6"
@@ -33,7 +33,7 @@ LINE = "#ffb84d"
 
 @dataclass(frozen=True)
 class Track:
-    """One vehicle: its poses (N, 3) as x_m, y_m, yaw_rad, the last one being the latest, and its median speed."""
+    """One road user: poses (N, 3) in world as x_m, y_m, yaw_rad, latest last, and the median speed."""
 
     vehicle: int
     label: str
@@ -42,22 +42,27 @@ class Track:
     poses: Floats
     frames: int
     speed_mps: float
-    farthest_m: float  # the longest distance it was seen from
+    farthest_m: float  # maximum distance from the ego
 
     @property
-    def moving(self) -> bool:
-        """Whether it moved. A parked car's estimates creep as the ego comes nearer, by a share of the distance, so its
-        speed alone does not tell."""
+    def is_moving(self) -> bool:
+        """Whether both its speed and its displacement exceed their limits.
+
+        The depth error of a parked car shrinks as the ego approaches. Its position therefore drifts by a share of the
+        distance.
+        """
         third = max(len(self.poses) // 3, 1)
-        way = np.median(self.poses[-third:, :2], axis=0) - np.median(self.poses[:third, :2], axis=0)
-        person = self.label in PEOPLE
-        creep_m = (PEOPLE_WAY_M if person else MOVING_WAY_M) + MOVING_WAY_REL * self.farthest_m
-        return self.speed_mps > (PEOPLE_SPEED_MPS if person else MOVING_SPEED_MPS) and float(np.hypot(*way)) > creep_m
+        displacement = np.median(self.poses[-third:, :2], axis=0) - np.median(self.poses[:third, :2], axis=0)
+        is_person = self.label in PEOPLE
+        min_speed_mps = MIN_PERSON_SPEED_MPS if is_person else MIN_MOVING_SPEED_MPS
+        min_distance_m = MIN_PERSON_DISTANCE_M if is_person else MIN_MOVING_DISTANCE_M
+        max_creep_m = min_distance_m + DEPTH_CREEP_RATIO * self.farthest_m
+        return self.speed_mps > min_speed_mps and float(np.hypot(*displacement)) > max_creep_m
 
 
 @dataclass(frozen=True)
 class Scene:
-    """All that the picture shows: ego poses (N, 3), points (M, 2) of the map, places (K, 2) where an epoch began."""
+    """The content of the picture: ego poses (N, 3), map points (M, 2), starts of epochs (K, 2)."""
 
     name: str
     ego: Floats
@@ -68,17 +73,17 @@ class Scene:
     path_m: float
     frames: int
     track_count: int
-    sigma_rel: float = 0.0  # 1-sigma of all lengths, where the camera's height or lens is an estimate
+    sigma_rel: float = 0.0  # 1-sigma of all lengths, due to camera height and lens
     lines: tuple[Floats, ...] = ()  # polylines (N, 2) of lane lines and road edges
 
 
 def draw(scene: Scene, path: Path) -> None:
-    """Write the picture. It holds no state between calls."""
-    # Here, since matplotlib takes half a second to import, which a node that starts up should not pay.
+    """Writes the picture."""
+    # Imported here because matplotlib takes half a second, which would delay the start of a node.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    tracks = [track for track in scene.tracks if track.frames >= SHORT_TRACK_FRAMES]
+    tracks = [track for track in scene.tracks if track.frames >= MIN_TRACK_FRAMES]
     x_min, x_max, y_min, y_max = _extent(scene, tracks)
     across, along = x_max - x_min, y_max - y_min
     map_in = np.array([across, along]) * LONG_SIDE_IN / max(across, along)
@@ -119,12 +124,12 @@ def draw(scene: Scene, path: Path) -> None:
 
 
 def _paper(points: Floats) -> Floats:
-    """World (N, >= 2) to paper (N, 2): forward up, left to the left."""
+    """Converts points from world (N, >= 2) to paper (N, 2): x up, y left."""
     return np.column_stack([-points[:, 1], points[:, 0]])
 
 
 def _extent(scene: Scene, tracks: list[Track]) -> tuple[float, float, float, float]:
-    """Limits on paper in metres that show everything but stray points, neither too thin nor too flat."""
+    """Returns limits on paper in metres that contain all but stray points, with a bounded aspect ratio."""
     parts = [_paper(scene.ego), *(_paper(track.poses) for track in tracks)]
     for points in (scene.lanes, scene.landmarks):
         if len(points):
@@ -143,17 +148,17 @@ def _extent(scene: Scene, tracks: list[Track]) -> tuple[float, float, float, flo
 
 
 def number_of(vehicle: int) -> int:
-    """As pictures show it: people's numbers restart."""
+    """Returns the number that pictures show; the numbers of people start at 0."""
     return vehicle & (FIRST_PERSON - 1)
 
 
 def colour_of(vehicle: int) -> tuple[float, float, float]:
-    """A colour of its own for each id; neighbours in number lie far apart in hue."""
+    """Returns a colour for the id; consecutive ids have distant hues."""
     return colorsys.hsv_to_rgb((0.02 + vehicle * 0.6180339887) % 1.0, 0.62, 1.0)
 
 
 def _footprint(pose: Floats, length_m: float, width_m: float, ahead_m: float) -> Floats:
-    """Outline (5, 2) on paper of a vehicle with a pointed nose, whose front is `ahead_m` before its pose."""
+    """Returns the outline (5, 2) on paper of a vehicle symbol whose front is `ahead_m` ahead of its pose."""
     half, back = width_m / 2.0, ahead_m - length_m
     shoulder = ahead_m - 0.22 * length_m
     outline = np.array([[back, half], [shoulder, half], [ahead_m, 0.0], [shoulder, -half], [back, -half]])
@@ -173,20 +178,20 @@ def _draw_track(axes: Any, track: Track, ego: Floats) -> None:
     from matplotlib.patches import Polygon
 
     colour = colour_of(track.vehicle)
-    way = _paper(track.poses)
-    if track.moving:
-        axes.plot(*way.T, color=colour, linewidth=3.4, alpha=0.75, solid_capstyle="round")
+    path = _paper(track.poses)
+    if track.is_moving:
+        axes.plot(*path.T, color=colour, linewidth=3.4, alpha=0.75, solid_capstyle="round")
     else:
-        axes.plot(*way.T, color=colour, linewidth=0.7, alpha=0.35)
+        axes.plot(*path.T, color=colour, linewidth=0.7, alpha=0.35)
     last = track.poses[-1]
     outline = _footprint(last, track.length_m, track.width_m, track.length_m / 2.0)
-    face = (*colour, 0.9) if track.moving else (*colour, 0.12)
+    face = (*colour, 0.9) if track.is_moving else (*colour, 0.12)
     axes.add_patch(Polygon(outline, closed=True, facecolor=face, edgecolor=colour, linewidth=1.1, zorder=4))
-    # The name stands on the side away from the ego's way, so that the two don't cover each other.
+    # The label is on the side away from the ego trajectory, so that it does not cover it.
     x_m, y_m, yaw_rad = ego[np.argmin(np.hypot(*(ego[:, :2] - last[:2]).T))]
     left = np.array([-np.sin(yaw_rad), np.cos(yaw_rad)])
     away = left if left @ (last[:2] - [x_m, y_m]) >= 0.0 else -left
-    half_m = float(np.abs((outline - way[-1]) @ _paper(away[None])[0]).max())
+    half_m = float(np.abs((outline - path[-1]) @ _paper(away[None])[0]).max())
     axes.annotate(
         f"{number_of(track.vehicle)}",
         _paper((last[:2] + half_m * away)[None])[0],
@@ -195,8 +200,8 @@ def _draw_track(axes: Any, track: Track, ego: Floats) -> None:
         ha="center",
         va="center",
         color=colour,
-        fontsize=8.5 if track.moving else 7,
-        weight="bold" if track.moving else "normal",
+        fontsize=8.5 if track.is_moving else 7,
+        weight="bold" if track.is_moving else "normal",
         clip_on=True,
         zorder=6,
     )
@@ -207,18 +212,18 @@ def _draw_ego(axes: Any, scene: Scene) -> None:
 
     if not len(scene.ego):
         return
-    way = _paper(scene.ego)
-    axes.plot(*way.T, color=EGO, linewidth=6.0, alpha=0.18, solid_capstyle="round", zorder=3)
-    axes.plot(*way.T, color=EGO, linewidth=1.8, solid_capstyle="round", zorder=5)
-    axes.plot(*way[0], "o", color=PAPER, markeredgecolor=EGO, markersize=6, zorder=5)
-    outline = _footprint(scene.ego[-1], EGO_LENGTH_M, EGO_WIDTH_M, EGO_AXLE_M)
+    path = _paper(scene.ego)
+    axes.plot(*path.T, color=EGO, linewidth=6.0, alpha=0.18, solid_capstyle="round", zorder=3)
+    axes.plot(*path.T, color=EGO, linewidth=1.8, solid_capstyle="round", zorder=5)
+    axes.plot(*path[0], "o", color=PAPER, markeredgecolor=EGO, markersize=6, zorder=5)
+    outline = _footprint(scene.ego[-1], EGO_LENGTH_M, EGO_WIDTH_M, EGO_FRONT_M)
     axes.add_patch(Polygon(outline, closed=True, facecolor=EGO, edgecolor=PAPER, linewidth=0.8, zorder=7))
     if len(scene.breaks):
         axes.plot(*_paper(scene.breaks).T, "X", color=BREAK, markeredgecolor=PAPER, markersize=9, zorder=8)
 
 
 def _draw_scale(axes: Any, across_m: float) -> None:
-    """A bar of a round length at the lower right."""
+    """Draws a scale bar of a round length at the lower right."""
     magnitude = 10.0 ** np.floor(np.log10(across_m / 4.0))
     length_m = max(step * magnitude for step in (1, 2, 5) if step * magnitude <= across_m / 4.0)
     x_max, y_min = axes.get_xlim()[1], axes.get_ylim()[0]
@@ -238,7 +243,7 @@ def _draw_scale(axes: Any, across_m: float) -> None:
 
 
 def _draw_panel(figure: Any, scene: Scene, tracks: list[Track], corner: tuple[float, float], room_in: float) -> None:
-    """The legend and, below it, the tracks seen in the most frames."""
+    """Draws the legend and a list of the longest tracks."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -247,15 +252,15 @@ def _draw_panel(figure: Any, scene: Scene, tracks: list[Track], corner: tuple[fl
             [], [], color=colour, linestyle="", marker=marker, markersize=4 if marker == "o" else 8, label=label
         )
 
-    handles: list[Any] = [Line2D([], [], color=EGO, linewidth=2.5, label="ego, from the ring to the arrow")]
-    if any(track.moving for track in tracks):
-        handles.append(Patch(facecolor=SAMPLE, edgecolor=SAMPLE, label="moving, last seen"))
-    if not all(track.moving for track in tracks):
-        handles.append(Patch(facecolor=f"{SAMPLE}26", edgecolor=SAMPLE, label="standing, last seen"))
+    handles: list[Any] = [Line2D([], [], color=EGO, linewidth=2.5, label="ego, from ring to arrow")]
+    if any(track.is_moving for track in tracks):
+        handles.append(Patch(facecolor=SAMPLE, edgecolor=SAMPLE, label="moving, last position"))
+    if not all(track.is_moving for track in tracks):
+        handles.append(Patch(facecolor=f"{SAMPLE}26", edgecolor=SAMPLE, label="stationary, last position"))
     if scene.lines:
-        handles.append(Line2D([], [], color=LINE, linewidth=1.5, label="line of the road, tracked"))
+        handles.append(Line2D([], [], color=LINE, linewidth=1.5, label="lane line or road edge, tracked"))
     if len(scene.lanes):
-        handles.append(mark(LANE, "o", "lane line"))
+        handles.append(mark(LANE, "o", "lane point"))
     if len(scene.landmarks):
         handles.append(mark(LANDMARK, "o", "road landmark"))
     if len(scene.breaks):
@@ -275,7 +280,9 @@ def _draw_panel(figure: Any, scene: Scene, tracks: list[Track], corner: tuple[fl
     line_in = 0.185
     used_in = 0.29 * len(handles) + 0.25
     room = int((room_in - used_in - 0.9) / line_in) - 2
-    listed = sorted(tracks, key=lambda track: (not track.moving, -track.frames))[: max(min(LISTED_TRACKS, room), 0)]
+    listed = sorted(tracks, key=lambda track: (not track.is_moving, -track.frames))[
+        : max(min(MAX_LISTED_TRACKS, room), 0)
+    ]
     if not listed:
         return
     height_in = figure.get_size_inches()[1]
@@ -286,13 +293,13 @@ def _draw_panel(figure: Any, scene: Scene, tracks: list[Track], corner: tuple[fl
 
     write(0, f"{'id':>4}  {'class':<{LABEL_CHARACTERS}} frames   m/s", FAINT)
     for line, track in enumerate(sorted(listed, key=lambda track: track.vehicle), start=1):
-        speed = f"{track.speed_mps:5.1f}" if track.moving else "    -"
+        speed = f"{track.speed_mps:5.1f}" if track.is_moving else "    -"
         name = track.label[:LABEL_CHARACTERS]
         write(
             line,
             f"{number_of(track.vehicle):>4}  {name:<{LABEL_CHARACTERS}} {track.frames:>6} {speed}",
             colour_of(track.vehicle),
         )
-    hidden = scene.track_count - len(listed)  # short ones among them
+    hidden = scene.track_count - len(listed)  # includes short tracks
     if hidden > 0:
         write(len(listed) + 1, f"      and {hidden} more", FAINT)

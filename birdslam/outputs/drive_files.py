@@ -1,10 +1,8 @@
-"""Results of a drive, written line by line as the estimates come.
+"""Writes the results of a drive, line by line. FILES lists them.
 
-`ego.kitti.txt`: camera poses `T_first_i`, row k is frame k (a frame without an estimate keeps the pose before it).
-`ego.tum.txt`, `tracks/ID.tum.txt`: the ego, and the footprint's centre of each vehicle seen, in world. `map.csv`: road
-landmarks and lane points in world, with their epoch and lane (-1: of none). `frames.csv`: a line a frame, with its
-statuses. `summary.json`: counts. `bev.png`: all of it from above. `README.txt`: how far to believe it, and what each
-file is. Where a new epoch begins TUM files carry a comment; KITTI rows go on from the last pose.
+Row k of `ego.kitti.txt` is the camera pose `T_first_k`; a frame without an estimate repeats the previous pose. TUM
+files hold the ego and the footprint centre of each vehicle in world. At a new epoch, TUM files contain a comment and
+the ego poses continue at the last pose.
 """
 
 from __future__ import annotations
@@ -17,7 +15,7 @@ from typing import Any, Self, TextIO
 
 import msgspec
 import numpy as np
-import scipy.spatial.transform  # noqa: F401  # at the start of a drive, not with its first frame (trajectory.py)
+import scipy.spatial.transform  # noqa: F401  # slow import: before the first frame, not with it (trajectory.py)
 
 from birdslam.geometry.camera import Camera
 from birdslam.outputs.bev_picture import draw
@@ -29,35 +27,35 @@ from birdslam.outputs.scene_recorder import MAX_POSES, MAX_TRACKS, SceneRecorder
 from birdslam.trajectory import CameraTrajectory, JoinedTrajectory, Transform, ego_pose, kitti_row, tum_row
 from birdslam.types import INVALIDATING, Attitude, Estimate, MapUpdate, Status, VehicleEstimate
 
-FILLED_FRAMES = 10_000  # a longer gap in the frame numbers is a new source, not dropped frames
+MAX_FILLED_FRAMES = 10_000  # a longer gap in the frame numbers is a new source, not dropped frames
 FRAMES_FILE = "frames.csv"
 FRAME_COLUMNS = ("frame", "t_s", "epoch", "x_m", "y_m", "yaw_rad", "speed_mps", "scale_sigma_rel", "valid", "status")
-FILES = {  # what README.txt says of each that is there
+FILES = {  # descriptions for README.txt
     "summary.json": "all counts, the configuration and the versions",
     "bev.png": "the drive from above",
-    "ego.tum.txt": "the car's way: time, place and attitude in metres, a line a frame",
-    "frames.csv": "a line a frame: place, speed, how sure a metre is, whether it is valid, and each status",
-    "report.html": "all of it to look at, in any browser",
-    "ego.kitti.txt": "the same as KITTI has it: the camera's poses",
-    "ego.final.tum.txt": "the car's way, smoothed when the drive was over",
-    "tracks": "the way of each other vehicle, as ego.tum.txt; ID.final.tum.txt: smoothed",
+    "ego.tum.txt": "the trajectory of the car: time, position and attitude of each frame, in metres",
+    "frames.csv": "position, speed, scale sigma, validity and statuses of each frame",
+    "report.html": "a page with all results, for any browser",
+    "ego.kitti.txt": "the camera poses in KITTI format",
+    "ego.final.tum.txt": "the final trajectory of the car, after the drive",
+    "tracks": "the trajectory of each other vehicle, as ego.tum.txt; ID.final.tum.txt is smoothed",
     "map.csv": "points of the road and of the lanes, in metres",
     "map.geojson": "lane lines and road edges as polylines, in metres",
-    PLACES_FILE: "where the car was in the map and on Earth, a line a metre, as all is known in the end",
-    ROAD_IN_MAP: "map.geojson and map.csv in the map's metres",
-    "road.geojson": "the road's lines on Earth; road.gpx and road.kml too",
-    "tracks.geojson": "the ways of other vehicles on Earth; tracks.gpx and tracks.kml too",
-    "camera.toml": "the camera as the first pass found it, for `--camera` next time",
-    "logs": "what each process said",
+    PLACES_FILE: "the position of the car in the map and on Earth, one row per metre, after the drive",
+    ROAD_IN_MAP: "map.geojson and map.csv in map coordinates",
+    "road.geojson": "lane lines and road edges in WGS 84, also as road.gpx and road.kml",
+    "tracks.geojson": "the trajectories of other vehicles in WGS 84, also as tracks.gpx and tracks.kml",
+    "camera.toml": "the camera estimated by the first pass, for `--camera`",
+    "logs": "the log of each process",
 }
 
 
 class ResultsError(ValueError):
-    """Results can't be written; the message names the directory and says why."""
+    """Results can't be read or written. The message names the path and the reason."""
 
 
 def claim_directory(directory: Path) -> None:
-    """Make the directory and see that it can be written to. Raises ResultsError where not."""
+    """Creates the directory and checks that it is writable. Raises ResultsError."""
     probe = directory / ".writable"
     try:
         directory.mkdir(parents=True, exist_ok=True)
@@ -69,16 +67,16 @@ def claim_directory(directory: Path) -> None:
 
 
 def write_json(path: Path, report: object) -> None:
-    """Writes structs, or lists of them, for people to read too."""
+    """Writes structs, or lists of them, as indented JSON."""
     path.write_bytes(msgspec.json.format(msgspec.json.encode(report), indent=2) + b"\n")
 
 
 class Recorder:
-    """Writes the results of one drive to a directory as they come; bounded in memory whatever its length.
+    """Writes the results of one drive to a directory, with bounded memory. Replaces earlier results there.
 
-    The mount of `trajectory.py` is the camera's calibrated ground plane, as for who integrates `Estimate.attitude`.
-    A context, so that its files are closed where a run fails; `finish` ends a run that did not.
-    Raises ResultsError where the directory can't be written to; results of an earlier run in it are replaced.
+    Camera poses are relative to the calibrated ground plane of the camera, as `Estimate.attitude` is. As a context
+    manager, it closes the files of a failed run; `finish` ends a complete run. Raises ResultsError if the directory is
+    not writable.
     """
 
     def __init__(self, directory: Path, camera: Camera) -> None:
@@ -93,7 +91,7 @@ class Recorder:
                 for name in ("summary.json", "bev.png", "README.txt", "report.html", *EGO_FILES.values(), *AROUND_FILES)
             )
             for old in (*self._tracks_directory.glob("*.tum.txt"), *later):
-                old.unlink(missing_ok=True)  # stale tracks beside new ones would be taken for this run's
+                old.unlink(missing_ok=True)
             names = ("ego.kitti.txt", "ego.tum.txt", "map.csv", FRAMES_FILE)
             self._kitti, self._tum, self._map, self._table = map(self._open, names)
             self._lines = LineMap(directory / "map.geojson")
@@ -109,7 +107,7 @@ class Recorder:
         self._trajectory, self._ego = CameraTrajectory(camera.ground), JoinedTrajectory()
         self._next_row = 0
         self._frames = self._invalid = 0
-        self._ends_unreadable = False  # the newest picture was damaged or missing
+        self._ends_unreadable = False  # the newest image was damaged or missing
         self._invalid_by: Counter[str] = Counter()
         self._path_m = self._valid_path_m = 0.0
         self._sigmas = Thinned(1, MAX_POSES)  # of the scale, in valid frames
@@ -117,7 +115,7 @@ class Recorder:
         self._epoch: int | None = None
         self._epoch_count = 0
         self._scene = SceneRecorder()
-        self._tracks: dict[int, tuple[str, int]] = {}  # of the vehicles seen last: the comment on its class, its epoch
+        self._tracks: dict[int, tuple[str, int]] = {}  # class comment and epoch of the most recent vehicles
         self._track_count = 0
 
     def _open(self, name: str) -> TextIO:
@@ -130,11 +128,11 @@ class Recorder:
         self.close()
 
     def close(self) -> None:
-        """Close the files; what was added stays in them. `finish` does it too."""
+        """Closes the files and keeps their content. `finish` calls it too."""
         self._files.close()
 
     def add(self, estimate: Estimate) -> None:
-        """One frame's estimate. The last record of a run, END_OF_SOURCE, is no frame and leaves no row."""
+        """Adds the estimate of one frame. The last record of a run, END_OF_SOURCE, is not a frame and adds no row."""
         if Status.END_OF_SOURCE in estimate.status:
             return
         if estimate.epoch != self._epoch:
@@ -163,20 +161,20 @@ class Recorder:
         self._last = estimate
 
     def add_map(self, update: MapUpdate) -> None:
-        """What the map gained."""
+        """Adds new points of the map."""
         for kind, points, lanes in (("landmark", update.landmarks_m, ()), ("lane", update.lanes_m, update.lane_ids)):
             self._map.writelines(
                 f"{update.epoch},{kind},{x_m:.3f},{y_m:.3f},{lane}\n"
                 for (x_m, y_m), lane in zip(points, lanes or (-1,) * len(points), strict=True)
             )
-        if update.epoch == self._epoch:  # of an older epoch: its place is not known any more
+        if update.epoch == self._epoch:  # the picture has the transform of the newest epoch only
             self._scene.add_map(update)
 
     def finish(self, summary: dict[str, Any], lengths_by: LengthsBy | None = None) -> list[str]:
-        """Write summary.json (`summary` over the recorder's own counts; a number that is not finite becomes null),
-        bev.png and README.txt, and close the files; gives the verdict on the drive (plain_words.py), a sentence each.
+        """Writes summary.json, bev.png and README.txt, and closes the files. Returns the sentences of the verdict.
 
-        `lengths_by`: what the camera's height and lens rest on; None: what is stated of them.
+        Entries of `summary` override the counts of the recorder; numbers that are not finite become null. `lengths_by`
+        states the source of camera height and lens; None takes the sigma of the camera.
         """
         self.close()
         sigmas = self._sigmas.array()
@@ -198,7 +196,7 @@ class Recorder:
         sentences = verdict(DriveCounts(**known, lengths_by=lengths_by or self._stated()))
         encoded = msgspec.json.encode({**counts, "verdict": sentences, **summary}, enc_hook=_plain)
         (self._directory / "summary.json").write_bytes(msgspec.json.format(encoded, indent=2) + b"\n")
-        write_around(self._directory)  # what is made of other files comes after what is nowhere else
+        write_around(self._directory)  # after the primary files: derived files can be written again
         name, lines = self._directory.resolve().name, tuple(self._lines.drawn())
         counted = {"path_m": self._path_m, "frames": self._frames, "track_count": self._track_count}
         scene = self._scene.scene(name=name, sigma_rel=self._camera.scale_sigma_rel, lines=lines, **counted)
@@ -220,7 +218,7 @@ class Recorder:
         )
 
     def _stated(self) -> LengthsBy:
-        """Of a camera whose file says how sure it is, but not why."""
+        """Returns the lengths of a camera that states its sigma, but not the source of it."""
         sigma_rel = self._camera.scale_sigma_rel
         return LengthsBy(height_sigma_rel=sigma_rel)
 
@@ -231,7 +229,7 @@ class Recorder:
         self._epoch_count += 1
 
     def _write_row(self, estimate: Estimate, T_world_ego: Transform) -> None:
-        if 0 < estimate.frame_id - self._next_row <= FILLED_FRAMES:
+        if 0 < estimate.frame_id - self._next_row <= MAX_FILLED_FRAMES:
             held = kitti_row(self._trajectory.last)
             self._kitti.writelines(held + "\n" for _ in range(estimate.frame_id - self._next_row))
         self._kitti.write(kitti_row(self._trajectory.add(estimate.epoch, T_world_ego)) + "\n")
@@ -243,7 +241,7 @@ class Recorder:
         if known is None and not path.exists():
             self._track_count += 1
             lines.append(f"# track {vehicle.vehicle}: t_s x_m y_m z_m qx qy qz qw of its footprint's centre in world")
-            lines.append("# z is the height of the road under the ego: a vehicle's own is not estimated")
+            lines.append("# z is the height of the road under the ego; the height under the vehicle is not estimated")
         if known is not None and known[1] != estimate.epoch:
             lines.append(f"# epoch {estimate.epoch}: a new world frame begins")
         described = f"# class {vehicle.label}, length_m {vehicle.length_m:.1f}, width_m {vehicle.width_m:.1f}"
@@ -251,15 +249,15 @@ class Recorder:
             lines.append(described)
         pose = ego_pose(vehicle.T_world_vehicle, Attitude(z_m=estimate.attitude.z_m))
         lines.append(tum_row(estimate.t_source_ns, pose))
-        with path.open("a", encoding="ascii", errors="backslashreplace") as file:  # so many tracks, so few descriptors
+        with path.open("a", encoding="ascii", errors="backslashreplace") as file:  # not kept open: too many descriptors
             file.write("\n".join(lines) + "\n")
-        self._tracks[vehicle.vehicle] = described, estimate.epoch  # the one seen last stands last
+        self._tracks[vehicle.vehicle] = described, estimate.epoch  # insertion order: the most recent is last
         if len(self._tracks) > MAX_TRACKS:
             del self._tracks[next(iter(self._tracks))]
 
 
 def _plain(value: object) -> object:
-    """What JSON does not know: numpy's numbers and arrays, paths."""
+    """Converts numpy numbers and arrays, and paths, for JSON."""
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     return str(value)

@@ -1,7 +1,4 @@
-"""The video of a drive: the camera's image with the vehicles' boxes beside the ego's bird's-eye view.
-
-Where the truth is known, thin white outlines show it in the bird's-eye view. All arrays are BGR.
-"""
+"""Draws the video of a drive: the camera image with boxes, beside the bird's-eye view. All arrays are BGR."""
 
 from __future__ import annotations
 
@@ -22,7 +19,7 @@ from birdslam.geometry.se2 import SE2
 from birdslam.lanes.outline import FROM_M, lane_px, line_px
 from birdslam.outputs.bev_picture import (
     EGO,
-    EGO_AXLE_M,
+    EGO_FRONT_M,
     EGO_LENGTH_M,
     EGO_WIDTH_M,
     FAINT,
@@ -38,17 +35,17 @@ from birdslam.outputs.bev_picture import (
 from birdslam.outputs.drive_files import ResultsError
 from birdslam.types import Estimate, Lanes, LineKind, MapUpdate, RoadUser
 
-MAX_SCALE, MAX_WIDTH_PX = 1.5, 1280  # of the camera's image, enlarged or reduced
-STRIP_PX, PANEL_PX = 96, 368  # height of the strip of text below the image, width of the bird's-eye view
-AHEAD_M, BEHIND_M = 50.0, 10.0  # shown of the bird's-eye view
-LANE_ALPHA = 0.18  # of the ego's lane over the image
-BOX_HEIGHT_M = 1.5  # of one whose height is not known
+MAX_SCALE, MAX_WIDTH_PX = 1.5, 1280  # of the resized camera image
+STRIP_PX, PANEL_PX = 96, 368  # height of the text below the image, width of the bird's-eye view
+AHEAD_M, BEHIND_M = 50.0, 10.0  # extent of the bird's-eye view
+LANE_ALPHA = 0.18  # of the ego lane over the image
+BOX_HEIGHT_M = 1.5  # if the height is unknown
 MAX_POINTS, MAX_POSES = 12_000, 400
-SHIFT = 4  # OpenCV's fractional bits: outlines don't jump from pixel to pixel
+SHIFT = 4  # fractional bits of OpenCV coordinates
 RING_M = 10.0
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 SUFFIX, CODEC = ".mp4", "mp4v"  # the codec that every build of OpenCV can write
-MAX_PICTURES_HZ = 20.0  # of the video: of faster cameras every second or third frame is drawn
+MAX_VIDEO_RATE_HZ = 20.0  # of faster cameras, every second or third frame is drawn
 
 
 def _bgr(colour: str) -> tuple[int, int, int]:
@@ -56,7 +53,7 @@ def _bgr(colour: str) -> tuple[int, int, int]:
 
 
 class SideBySide:
-    """Draws frame after frame; what the map gained is added as it came."""
+    """Draws one picture per frame."""
 
     def __init__(self, camera: Camera) -> None:
         self._camera = camera
@@ -68,21 +65,21 @@ class SideBySide:
         self._epoch: int | None = None
         self._lanes: deque[tuple[float, float]] = deque(maxlen=MAX_POINTS)
         self._landmarks: deque[tuple[float, float]] = deque(maxlen=MAX_POINTS)
-        self._way: deque[tuple[float, float]] = deque(maxlen=MAX_POSES)
+        self._path: deque[tuple[float, float]] = deque(maxlen=MAX_POSES)
 
     def add_map(self, update: MapUpdate) -> None:
-        """Points in world of the update's epoch."""
+        """Adds points in world of the epoch of the update."""
         self._enter(update.epoch)
         self._lanes.extend(update.lanes_m)
         self._landmarks.extend(update.landmarks_m)
 
     def draw(self, image: Image, estimate: Estimate, true_outlines: Sequence[Floats], words: Sequence[str]) -> Image:
-        """(H, W, 3) of `size_px`, from the undistorted `image`, (H, W) grey or (H, W, 3) BGR.
+        """Returns a picture (H, W, 3) of `size_px` from the undistorted `image`, (H, W) grey or (H, W, 3) BGR.
 
-        `true_outlines` are (4, 2) footprints in ego.
+        `true_outlines` are footprints (4, 2) in ego, drawn as white outlines.
         """
         self._enter(estimate.epoch)
-        self._way.append((estimate.T_world_ego.x_m, estimate.T_world_ego.y_m))
+        self._path.append((estimate.T_world_ego.x_m, estimate.T_world_ego.y_m))
         canvas = np.full((self.size_px[1], self.size_px[0], 3), _bgr(PAPER), np.uint8)
         width_px, height_px = self._image_px
         canvas[:height_px, :width_px] = self._camera_view(image, estimate)
@@ -94,10 +91,10 @@ class SideBySide:
         return canvas
 
     def _enter(self, epoch: int) -> None:
-        if epoch != self._epoch:  # nothing is known of where the old world lies in the new one
+        if epoch != self._epoch:  # the transform between the two worlds is unknown
             self._lanes.clear()
             self._landmarks.clear()
-            self._way.clear()
+            self._path.clear()
             self._epoch = epoch
 
     def _camera_view(self, image: Image, estimate: Estimate) -> Image:
@@ -106,7 +103,7 @@ class SideBySide:
         ground = self._camera.ground
         if estimate.ground is not None:
             ground = GroundPlane(estimate.ground.height_m, estimate.ground.pitch_rad, estimate.ground.roll_rad)
-        solids: list[tuple[RoadUser, Floats, Floats]] = []  # with its foot in ego, and its eight corners in pixels
+        solids: list[tuple[RoadUser, Floats, Floats]] = []  # footprint in ego, eight corners in pixels
         for vehicle in estimate.road_users:
             if not vehicle.in_sight:
                 continue
@@ -114,14 +111,14 @@ class SideBySide:
             corners = np.vstack(
                 [np.column_stack([foot, np.full(4, z_m)]) for z_m in (0.0, vehicle.height_m or BOX_HEIGHT_M)]
             )
-            if corners[:, 0].min() < 1.0:  # reaches behind the image plane
+            if corners[:, 0].min() < 1.0:  # partly behind the image plane
                 continue
             px = (bev.ego_to_pixel(self._camera, ground, corners) + 0.5) * self._scale - 0.5
             solids.append((vehicle, foot, px))
         if estimate.lanes is not None:
             before = view.copy()
             self._draw_lanes(view, ground, estimate.lanes)
-            in_front = np.zeros(view.shape[:2], np.uint8)  # what stands on the road hides the road behind it
+            in_front = np.zeros(view.shape[:2], np.uint8)  # road users hide the lanes behind them
             for _, _, px in solids:
                 cv2.fillConvexPoly(in_front, cv2.convexHull(_fixed(px)), 1, cv2.LINE_8, SHIFT)
             np.copyto(view, before, where=in_front[:, :, None] > 0)
@@ -137,7 +134,7 @@ class SideBySide:
         return view
 
     def _draw_lanes(self, view: Image, ground: GroundPlane, lanes: Lanes) -> None:
-        """The ego's lane as a shade, and the lines, not over the bonnet: paint, and dimmer the road's edges."""
+        """Shades the ego lane and draws lane lines and, dimmer, road edges, beyond the bonnet."""
         from_m = max(lanes.road_from_m, FROM_M)
         ground = GroundPlane(ground.height_m, ground.pitch_rad + lanes.tilt_rad, ground.roll_rad)
         bend = lanes.vertical_curvature_per_m
@@ -169,8 +166,8 @@ class SideBySide:
             at_m = np.column_stack([x_m, [line.y_m(x) for x in x_m.tolist()]])
             colour = FAINT if line.kind is LineKind.EDGE else LINE
             cv2.polylines(panel, [_fixed(self._panel_px(at_m))], False, _bgr(colour), 1, cv2.LINE_AA, SHIFT)
-        way = _fixed(self._panel_px(T_ego_world @ np.array(self._way)))
-        cv2.polylines(panel, [way], False, _bgr(EGO), 2, cv2.LINE_AA, SHIFT)
+        path = _fixed(self._panel_px(T_ego_world @ np.array(self._path)))
+        cv2.polylines(panel, [path], False, _bgr(EGO), 2, cv2.LINE_AA, SHIFT)
         for fan in estimate.hidden:
             cv2.polylines(
                 panel, [_fixed(self._panel_px(np.array(fan.corners_m)))], True, _bgr(FAINT), 1, cv2.LINE_AA, SHIFT
@@ -186,12 +183,12 @@ class SideBySide:
                 cv2.putText(panel, name_of(vehicle), (int(u) + 2, int(v)), FONT, 0.35, _bgr(INK), 1, cv2.LINE_AA)
         for true in true_outlines:
             cv2.polylines(panel, [_fixed(self._panel_px(true))], True, (255, 255, 255), 1, cv2.LINE_AA, SHIFT)
-        own = outline(SE2(EGO_AXLE_M - EGO_LENGTH_M / 2.0, 0.0, 0.0), EGO_LENGTH_M, EGO_WIDTH_M)
+        own = outline(SE2(EGO_FRONT_M - EGO_LENGTH_M / 2.0, 0.0, 0.0), EGO_LENGTH_M, EGO_WIDTH_M)
         cv2.fillPoly(panel, [_fixed(self._panel_px(own))], _bgr(EGO), cv2.LINE_AA, SHIFT)
         return panel
 
     def _panel_px(self, points: Floats) -> Floats:
-        """Of points (N, 2) in ego: forward up, left to the left."""
+        """Converts points (N, 2) from ego to panel pixels: x up, y left."""
         out: Floats = np.column_stack(
             [PANEL_PX / 2.0 - points[:, 1] * self._per_m, (AHEAD_M - points[:, 0]) * self._per_m]
         )
@@ -199,11 +196,11 @@ class SideBySide:
 
 
 class DriveVideo:
-    """Draws a drive's frames as its estimates come, in order; a context, so that the file is whole where a run ends.
+    """Draws the frames of a drive. As a context manager, it completes the file if a run fails.
 
-    `frames` are (frame_id, source time in ns, undistorted image or None), in order and without end or not: they are
-    taken up to the last estimate. A frame that was not estimated shows the estimate before it. `truth` gives the true
-    footprints (4, 2) in ego of a frame. Raises ResultsError where the file can't be written.
+    `frames` are (frame_id, source time in ns, undistorted image or None) in order; they are read up to the last
+    estimate and may be endless. A frame without an estimate shows the previous one. `truth` returns the true footprints
+    (4, 2) in ego of a frame. Raises ResultsError if the file can't be written.
     """
 
     def __init__(
@@ -215,7 +212,7 @@ class DriveVideo:
         truth: Callable[[int], Sequence[Floats]] | None = None,
     ) -> None:
         self._view = SideBySide(camera)
-        self._every = math.ceil(rate_hz / MAX_PICTURES_HZ)
+        self._every = math.ceil(rate_hz / MAX_VIDEO_RATE_HZ)
         self._frames, self._truth = frames, truth
         self._next: tuple[int, int, Image | None] | None = None
         self._estimate: Estimate | None = None
@@ -223,22 +220,22 @@ class DriveVideo:
         self.drawn_frame = -1
 
     def add(self, estimate: Estimate) -> None:
-        """One frame's estimate; draws the frames before it."""
+        """Draws the frames before this estimate."""
         self._draw_until(estimate.frame_id)
         self._estimate = estimate
 
     def add_map(self, update: MapUpdate) -> None:
-        """What the map gained with the frame whose estimate was added last."""
+        """Adds the new map points of the latest estimate."""
         self._view.add_map(update)
 
     def finish(self) -> None:
-        """The frame of the last estimate, and the end of the file."""
+        """Draws the frame of the last estimate and closes the file."""
         if self._estimate is not None:
             self._draw_until(self._estimate.frame_id + 1)
         self._writer.release()
 
     def _draw_until(self, end: int) -> None:
-        """All frames before `end`."""
+        """Draws all frames before frame `end`."""
         while True:
             self._next = next(self._frames, None) if self._next is None else self._next
             if self._next is None or self._next[0] >= end:
@@ -255,7 +252,7 @@ class DriveVideo:
         words = (
             f"BirdSLAM  {t_ns * 1e-9:5.1f} s  frame {estimate.frame_id}  {seen} vehicles, {people} people in sight",
             f"right: from above, 10 m rings; filled: estimates, {white}cyan: ego",
-            " ".join(status.value for status in estimate.status) or "all well",
+            " ".join(status.value for status in estimate.status) or "no remarks",
         )
         truth = self._truth(estimate.frame_id) if self._truth else ()
         return self._view.draw(image, estimate, truth, words)
@@ -268,9 +265,9 @@ class DriveVideo:
 
 
 def check_video(path: Path, camera: Camera, rate_hz: float) -> None:
-    """Raises ResultsError where a video of this camera can't be written there; what lies there stays as it is.
+    """Raises ResultsError if a video of this camera can't be written to `path`. Keeps an existing file.
 
-    Folders on the way to it are made, as those of the results are.
+    Creates missing parent directories.
     """
     if path.suffix != SUFFIX:
         raise ResultsError(f"video {path}: expected FILE{SUFFIX}")
@@ -279,7 +276,7 @@ def check_video(path: Path, camera: Camera, rate_hz: float) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ResultsError(f"video {path}: {path.parent} can't be made: {error.strerror}") from None
+        raise ResultsError(f"video {path}: {path.parent} can't be created: {error.strerror}") from None
     probe = path.with_name(f".{path.stem}.probe{SUFFIX}")
     try:
         probe.touch()
@@ -293,18 +290,18 @@ def check_video(path: Path, camera: Camera, rate_hz: float) -> None:
 def _open_writer(path: Path, rate_hz: float, size_px: tuple[int, int]) -> cv2.VideoWriter:
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*CODEC), rate_hz, size_px)
     if not writer.isOpened():
-        raise ResultsError(f"video {path}: this OpenCV can't write {CODEC} there")
+        raise ResultsError(f"video {path}: this build of OpenCV can't write {CODEC} there")
     return writer
 
 
 def outline(pose: SE2, length_m: float, width_m: float) -> Floats:
-    """Corners (4, 2) of a footprint whose centre is `pose`."""
+    """Returns the corners (4, 2) of a footprint centred at `pose`."""
     x_m, y_m = length_m / 2.0, width_m / 2.0
     return pose @ np.array([[x_m, y_m], [x_m, -y_m], [-x_m, -y_m], [-x_m, y_m]])
 
 
 def name_of(user: RoadUser) -> str:
-    """Its number, with the class of who is no car."""
+    """Returns the number, preceded by the class unless it is a car."""
     number = number_of(user.vehicle)
     return f"{number}" if user.label == "car" else f"{user.label} {number}"
 

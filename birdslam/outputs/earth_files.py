@@ -1,4 +1,4 @@
-"""Ways and places on Earth as GeoJSON (RFC 7946), GPX 1.1 and KML 2.2; WGS 84, degrees."""
+"""Writes lines on Earth as GeoJSON (RFC 7946), GPX 1.1 and KML 2.2, in WGS 84 degrees."""
 
 from __future__ import annotations
 
@@ -17,48 +17,48 @@ SUFFIXES = ".geojson", ".gpx", ".kml"
 
 
 @dataclass(frozen=True, eq=False)
-class Way:
-    """A line on Earth: (N, 2) latitude and longitude in degrees; times of the recording, 0 where there are none."""
+class GeoLine:
+    """A line on Earth: latitude and longitude (N, 2) in degrees, with the times of the recording if known."""
 
     name: str
     degrees: Floats
     t_ns: Sequence[int] = ()
-    about: dict[str, float | int | str] | None = None
+    properties: dict[str, float | int | str] | None = None
 
 
-def write_ways(path: Path, ways: Sequence[Way]) -> None:
-    """As the file's name says: .geojson, .gpx or .kml. Raises ValueError for another, OSError."""
-    made = {".geojson": _geojson, ".gpx": _gpx, ".kml": _kml}.get(path.suffix.lower())
-    if made is None:
-        raise ValueError(f"{path}: a place on Earth is written as {', '.join(SUFFIXES)}")
-    path.write_text(made([way for way in ways if len(way.degrees) > 1]), encoding="utf-8")
+def write_geo_lines(path: Path, lines: Sequence[GeoLine]) -> None:
+    """Writes the format of the suffix: .geojson, .gpx or .kml. Raises ValueError for another suffix, OSError."""
+    encode = {".geojson": _geojson, ".gpx": _gpx, ".kml": _kml}.get(path.suffix.lower())
+    if encode is None:
+        raise ValueError(f"{path}: expected a suffix of {', '.join(SUFFIXES)}")
+    path.write_text(encode([line for line in lines if len(line.degrees) > 1]), encoding="utf-8")
 
 
-def _geojson(ways: Sequence[Way]) -> str:
+def _geojson(lines: Sequence[GeoLine]) -> str:
     features = [
         {
             "type": "Feature",
-            "properties": {"name": way.name, **(way.about or {})},
+            "properties": {"name": line.name, **(line.properties or {})},
             "geometry": {
                 "type": "LineString",
-                "coordinates": [[round(float(lon), 8), round(float(lat), 8)] for lat, lon in way.degrees],
+                "coordinates": [[round(float(lon), 8), round(float(lat), 8)] for lat, lon in line.degrees],
             },
         }
-        for way in ways
+        for line in lines
     ]
     return msgspec.json.encode({"type": "FeatureCollection", "features": features}).decode() + "\n"
 
 
-def _gpx(ways: Sequence[Way]) -> str:
+def _gpx(lines: Sequence[GeoLine]) -> str:
     out = [
         '<?xml version="1.0" encoding="UTF-8"?>',
         '<gpx version="1.1" creator="BirdSLAM" xmlns="http://www.topografix.com/GPX/1/1">',
     ]
-    for way in ways:
-        out.append(f"<trk><name>{escape(way.name)}</name><trkseg>")
-        times = way.t_ns or (0,) * len(way.degrees)
-        for (lat, lon), t_ns in zip(way.degrees, times, strict=True):
-            time = f"<time>{_time(t_ns)}</time>" if way.t_ns else ""
+    for line in lines:
+        out.append(f"<trk><name>{escape(line.name)}</name><trkseg>")
+        times = line.t_ns or (0,) * len(line.degrees)
+        for (lat, lon), t_ns in zip(line.degrees, times, strict=True):
+            time = f"<time>{_time(t_ns)}</time>" if line.t_ns else ""
             out.append(f'<trkpt lat="{lat:.8f}" lon="{lon:.8f}">{time}</trkpt>')
         out.append("</trkseg></trk>")
     return "\n".join([*out, "</gpx>", ""])
@@ -70,17 +70,17 @@ def _time(t_ns: int) -> str:
     )
 
 
-def _kml(ways: Sequence[Way]) -> str:
+def _kml(lines: Sequence[GeoLine]) -> str:
     out = ['<?xml version="1.0" encoding="UTF-8"?>', '<kml xmlns="http://www.opengis.net/kml/2.2"><Document>']
-    for way in ways:
+    for line in lines:
         data = "".join(
             f"<Data name={quoteattr(key)}><value>{escape(str(value))}</value></Data>"
-            for key, value in (way.about or {}).items()
+            for key, value in (line.properties or {}).items()
         )
-        out.append(f"<Placemark><name>{escape(way.name)}</name>")
+        out.append(f"<Placemark><name>{escape(line.name)}</name>")
         if data:
             out.append(f"<ExtendedData>{data}</ExtendedData>")
         out.append("<LineString><tessellate>1</tessellate><coordinates>")
-        out.append(" ".join(f"{lon:.8f},{lat:.8f}" for lat, lon in way.degrees))
+        out.append(" ".join(f"{lon:.8f},{lat:.8f}" for lat, lon in line.degrees))
         out.append("</coordinates></LineString></Placemark>")
     return "\n".join([*out, "</Document></kml>", ""])

@@ -1,9 +1,7 @@
-"""The final trajectories of a drive, beside the live ones: poses as they are known once the drive is over.
+"""Writes the final trajectories of a drive, which use later measurements as well.
 
-`tracks/ID.final.tum.txt`: one vehicle by the RTS smoother (vehicles/rts_smoother.py). `ego.final.*`:
-the ego's live poses again, as in the evaluation: no loop is closed, so that hardly anything seen later bears on a pose
-that has left the graph's window. Of vehicles the sizes are learned over time, and where one stops or turns is known
-best from both sides.
+`tracks/ID.final.tum.txt` is one vehicle, smoothed (vehicles/rts_smoother.py). `ego.final.*` copies the live ego
+poses: without loop closures, later measurements hardly change a pose outside the window of the graph.
 """
 
 from __future__ import annotations
@@ -22,15 +20,14 @@ TRACK_SUFFIX = ".final.tum.txt"
 
 
 def last_seen(log: Iterable[Measurements]) -> dict[int, int]:
-    """Vehicle -> the last frame with an edge of it."""
+    """Returns the last frame with an edge, by vehicle."""
     return {edge.vehicle: measurements.frame_id for measurements in log for edge in measurements.cv}
 
 
 class FinalTracks:
-    """Smooths and writes each vehicle as soon as its last frame has come; in memory are those that are still to come.
+    """Smooths and writes each vehicle after its last frame. Frames are in order.
 
-    Frames come in order. `last_frames` is the last frame with an edge of each vehicle (`last_seen`): however long the
-    drive, memory holds those vehicles alone that come again.
+    `last_frames` are the results of `last_seen`. Memory holds only the vehicles that appear again.
     """
 
     def __init__(
@@ -39,22 +36,22 @@ class FinalTracks:
         last_frames: Mapping[int, int],
         config: SmootherConfig = SmootherConfig(),  # noqa: B008
     ) -> None:
-        """`directory` is that of the live tracks; it is there. Raises OSError where a file can't be written."""
+        """`directory` is the existing directory of the live tracks. Methods raise OSError."""
         self._directory = directory
         self._last_frames = last_frames
         self._smoother = RtsSmoother(config)
         self._epoch: int | None = None
         self._open: dict[int, _OpenTrack] = {}
         self._written: set[int] = set()
-        self._measurements: Measurements | None = None  # of the estimate to come
+        self._measurements: Measurements | None = None  # of the next estimate
 
     @property
     def vehicles(self) -> int:
-        """How many have a final trajectory by now."""
+        """The number of final trajectories so far."""
         return len(self._written)
 
     def take(self, record: Measurements | Estimate | MapUpdate) -> None:
-        """The next record of a drive: of each frame the Measurements, then its Estimate."""
+        """Takes the next record of a drive: for each frame the Measurements, then the Estimate."""
         if isinstance(record, Measurements):
             self._measurements = record
         elif isinstance(record, Estimate):
@@ -63,9 +60,9 @@ class FinalTracks:
                 self.add(measurements, record)
 
     def add(self, measurements: Measurements, estimate: Estimate) -> None:
-        """One frame's edges, and where they left everybody."""
+        """Adds the edges and the estimate of one frame."""
         if estimate.epoch != self._epoch:
-            self._close(list(self._open))  # their world has ended
+            self._close(list(self._open))
             self._epoch = estimate.epoch
         self._smoother.add(measurements, estimate)
         known = {vehicle.vehicle for vehicle in estimate.vehicles}
@@ -77,7 +74,7 @@ class FinalTracks:
         self._close([v for v in self._open if self._last_frames.get(v, -1) <= estimate.frame_id])
 
     def finish(self) -> None:
-        """Writes the rest."""
+        """Writes the remaining vehicles."""
         self._close(list(self._open))
 
     def _close(self, vehicles: Iterable[int]) -> None:
@@ -95,7 +92,7 @@ class FinalTracks:
             file.write(f"# epoch {track.epoch}: a new world frame begins\n")
         else:
             file.write(f"# track {vehicle}, smoothed: t_s x_m y_m z_m qx qy qz qw of its footprint's centre in world\n")
-            file.write("# z is the height of the road under the ego: a vehicle's own is not estimated\n")
+            file.write("# z is the height of the road under the ego; the height under the vehicle is not estimated\n")
         if track.last is not None:
             edge = track.last
             file.write(f"# class {edge.label}, length_m {edge.length_m:.1f}, width_m {edge.width_m:.1f}\n")
@@ -107,11 +104,11 @@ class FinalTracks:
 class _OpenTrack:
     def __init__(self, epoch: int) -> None:
         self.epoch = epoch
-        self.seen: dict[int, tuple[int, float]] = {}  # frame -> source time (ns), the road's height (m)
+        self.seen: dict[int, tuple[int, float]] = {}  # frame -> source time (ns), road height (m)
         self.last: VehicleEdge | None = None
 
 
 def write_final_ego(directory: Path) -> None:
-    """The ego's final trajectory beside its live one. Raises OSError where that can't be."""
+    """Writes the final trajectory of the ego next to the live one. Raises OSError."""
     for live, final in EGO_FILES.items():
         shutil.copyfile(directory / live, directory / final)

@@ -1,4 +1,4 @@
-"""Fig. 4 of the paper on any drive: a frame, its cells of lane boundary and road, the lanes without and with ENet."""
+"""Draws Fig. 4 of the paper for one frame: image, boundary and road cells, lanes without and with ENet."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from birdslam.geometry.arrays import Floats32
 from birdslam.lanes.amodal.lanes import BOUNDARY, ROAD, LanesConfig, LaneView
 
 TITLES = (
-    "lane boundary, seen",
-    "road, seen",
+    "lane boundary, observed",
+    "road, observed",
     "lanes without ENet",
     "lane boundary, completed",
     "road, completed",
     "lanes",
-    "lane boundary, later",
-    "road, later",
+    "lane boundary, later frames",
+    "road, later frames",
 )
-HIDDEN_ALPHA = 0.25  # of cells, behind lanes
+HIDDEN_ALPHA = 0.25  # of cells behind lanes
 
 
 def draw_lanes(
     title: str, image: NDArray[np.uint8], view: LaneView, config: LanesConfig, path: Path, later: Floats32 | None = None
 ) -> None:
-    """`image` (H, W) grey or (H, W, 3) BGR above; below it the grids from above, forward up and left to the left.
+    """Draws `image`, (H, W) grey or (H, W, 3) BGR, above the bird's-eye grids (x up, y left).
 
-    `later` (2, rows, columns): what later frames saw of the same place.
+    `later` (2, rows, columns) holds the observations of the same cells by later frames.
     """
-    # Here, since matplotlib takes half a second to import
+    # Imported here because matplotlib takes half a second
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -52,7 +52,7 @@ def draw_lanes(
         axes = figure.add_subplot(rows[1, k])
         lanes = {2: view.lanes_seen, 5: view.lanes}.get(k)
         alpha = 1.0 if lanes is None else HIDDEN_ALPHA
-        # Columns of a grid begin on the right, rows behind
+        # Column 0 of a grid is at the right, row 0 at the rear
         axes.imshow(grid[:, ::-1], origin="lower", extent=extent, cmap="Greys", vmin=0.0, vmax=1.0, alpha=alpha)
         for j, cloud in enumerate(lanes or ()):
             axes.scatter(cloud[:, 1], cloud[:, 0], s=4, color=f"C{j % 10}")

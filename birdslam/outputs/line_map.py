@@ -1,7 +1,7 @@
-"""map.geojson: the lines of a drive as polylines in metres of the epoch's world, each written when it has ended.
+"""Writes map.geojson: the lines of a drive as polylines in metres in world of their epoch.
 
-A vertex is where a line was when the ego was NODE_AT_M before it: there it is in view and known best. Memory is
-bounded: only lines in sight are held, and of the others so much as a picture shows.
+A vertex is the position of the line NODE_AT_M ahead of the ego, where its covariance is least. A line is written when
+it ends; memory holds the lines in view and at most MAX_DRAWN vertices of the others.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from birdslam.loops.keyframe_builder import MIN_EXISTENCE, NODE_AT_M, NODE_EVERY
 from birdslam.types import NS_PER_S, Estimate, LaneLine
 
 MIN_NODES = 3
-ENDED_NS = 3 * NS_PER_S  # a line not seen for so long has ended
+MAX_UNSEEN_NS = 3 * NS_PER_S  # then the line ends
 MAX_DRAWN = 20_000  # vertices for the picture
-TAIL_M = 30.0  # what lies ahead when a drive ends
+MAX_TAIL_M = 30.0  # of a line ahead at the end of a drive
 
 
 @dataclass
@@ -34,12 +34,12 @@ class _Polyline:
     kinds: dict[str, int] = field(default_factory=dict)
     colours: dict[str, int] = field(default_factory=dict)
     points_m: list[tuple[float, float]] = field(default_factory=list)  # in world
-    sigmas_m: list[float] = field(default_factory=list)  # across the line, against the ego
+    sigmas_m: list[float] = field(default_factory=list)  # across the line, relative to the ego
     widths_m: list[float | None] = field(default_factory=list)  # of the lane to its right
 
 
 class LineMap:
-    """Takes estimate after estimate; `close` ends the file."""
+    """Writes the lines of consecutive estimates to one file, until `close`."""
 
     def __init__(self, path: Path) -> None:
         self._file: TextIO = path.open("w", encoding="ascii")
@@ -47,29 +47,29 @@ class LineMap:
         self._file.write('"features": [')
         self._first = True
         self._open: dict[int, _Polyline] = {}
-        self._way_m = 0.0
+        self._travelled_m = 0.0
         self._last: Estimate | None = None
         self._drawn: list[Floats] = []
         self._drawn_count = 0
 
     def add(self, estimate: Estimate, T_picture_world: SE2) -> None:
-        """One frame's estimate; `T_picture_world` puts its epoch into the picture."""
+        """Adds the estimate of one frame. `T_picture_world` is the transform from its epoch to the picture."""
         last, self._last = self._last, estimate
         if last is not None and last.epoch != estimate.epoch:
             self._end(list(self._open.values()))
             last = None
         if last is not None:
             step = last.T_world_ego.between(estimate.T_world_ego)
-            self._way_m += float(np.hypot(step.x_m, step.y_m))
+            self._travelled_m += float(np.hypot(step.x_m, step.y_m))
         lanes = estimate.lanes
-        if lanes is None or not estimate.valid or (last is not None and self._way_m < NODE_EVERY_M):
+        if lanes is None or not estimate.valid or (last is not None and self._travelled_m < NODE_EVERY_M):
             return
-        self._way_m = 0.0
+        self._travelled_m = 0.0
         widths = {lane.left: lane.width_m for lane in lanes.lanes if lane.left is not None}
         for line in lanes.lines:
             if line.existence >= MIN_EXISTENCE and line.seen_from_m < NODE_AT_M < line.seen_to_m:
                 self._add_node(estimate, line, widths.get(line.line), T_picture_world)
-        self._end([p for p in self._open.values() if estimate.t_source_ns - p.last_ns > ENDED_NS])
+        self._end([p for p in self._open.values() if estimate.t_source_ns - p.last_ns > MAX_UNSEEN_NS])
 
     def _add_node(self, estimate: Estimate, line: LaneLine, width_m: float | None, T_picture_world: SE2) -> None:
         new = _Polyline(line.line, estimate.epoch, estimate.t_source_ns, T_picture_world)
@@ -90,18 +90,20 @@ class LineMap:
                     self._drawn_count += len(polyline.points_m)
 
     def drawn(self) -> list[Floats]:
-        """Polylines (N, 2) for the picture, in its frame; after `close`."""
+        """Returns polylines (N, 2) in the frame of the picture, after `close`."""
         return self._drawn
 
     def close(self) -> None:
-        """Writes the lines in sight, with what was seen of them ahead, and ends the file."""
+        """Writes the lines in view up to MAX_TAIL_M ahead and closes the file."""
         if self._file.closed:
             return
         last = self._last
         if last is not None and last.lanes is not None:
             for line in last.lanes.lines:
                 if line.line in self._open:
-                    ahead = np.arange(NODE_AT_M + NODE_EVERY_M, min(line.seen_to_m, line.to_m, TAIL_M), NODE_EVERY_M)
+                    ahead = np.arange(
+                        NODE_AT_M + NODE_EVERY_M, min(line.seen_to_m, line.to_m, MAX_TAIL_M), NODE_EVERY_M
+                    )
                     _extend(self._open[line.line], last, line, ahead, None)
         self._end(list(self._open.values()))
         self._file.write("\n]}\n")

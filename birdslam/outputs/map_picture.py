@@ -1,4 +1,4 @@
-"""A map of places from above, as a PNG: keyframes by the drive that they are of, loops, lines of the road, points."""
+"""Draws a place map from above as a PNG: keyframes coloured by drive, loops, lines and points."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import numpy as np
 from birdslam.loops.place_map import PlaceMap
 
 SIDE_IN, DPI = 9.0, 130
-NEAR_M = 30.0  # points farther from their keyframe are too inexact to be drawn
+MAX_POINT_DISTANCE_M = 30.0  # from the keyframe; farther points are inaccurate
 PAPER, INK, FAINT, LOOP = "#12161d", "#e8ebf0", "#5f6b7c", "#ff9d3d"
-LINES = {"yellow": "#ffd54a", "edge": "#b08968"}  # else INK
+LINES = {"yellow": "#ffd54a", "edge": "#b08968"}  # INK for others
 DRIVES = "#35d0ff", "#7bd88f", "#f3ecd2", "#ff8fa3", "#c39bff"
 
 
 def draw_map(place_map: PlaceMap, path: Path) -> None:
-    """Forward (x) is up. Raises OSError."""
+    """Writes the picture, x up and y left. Raises OSError."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -26,7 +26,9 @@ def draw_map(place_map: PlaceMap, path: Path) -> None:
     points = [
         (keyframe.T_map_keyframe @ near[:, :2])
         for keyframe in place_map.keyframes
-        for near in [keyframe.points_m[np.hypot(keyframe.points_m[:, 0], keyframe.points_m[:, 1]) < NEAR_M]]
+        for near in [
+            keyframe.points_m[np.hypot(keyframe.points_m[:, 0], keyframe.points_m[:, 1]) < MAX_POINT_DISTANCE_M]
+        ]
     ]
     if points:
         x, y = np.concatenate(points).T

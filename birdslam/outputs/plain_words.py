@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from birdslam.types import INVALIDATING, SpeedSource, Status
 
-# What each status means, for people; status.py defines it for planners
+# The meaning of each status for people; status.py defines it for planners
 MEANINGS: Mapping[Status, str] = {
     Status.END_OF_SOURCE: "the film or the camera has ended",
     Status.FRAME_UNREADABLE: "the image is damaged or missing",
@@ -58,13 +58,13 @@ REMEDIES: Mapping[Status, str] = {
     Status.COASTED_TOO_LONG: "process every frame, slower than real time (--rate max)",
     Status.CAR_SPEED_IMPLAUSIBLE: "check that the speed file and the film use the same clock",
 }
-WORTH_MEASURING_REL = 0.04  # a tape measure or a data sheet is better than this
-OFTEN = 0.2  # share of the frames from which on a remedy is given
+MAX_SIGMA_REL = 0.04  # a tape measure or a data sheet is more accurate
+MIN_REMEDY_SHARE = 0.2  # of the frames
 REPORTED = (Status.CALIBRATION_DRIFT, Status.SCALE_ESTIMATED, Status.VIEW_OBSTRUCTED, Status.STANDSTILL)
 
 
 class LengthsBy(NamedTuple):
-    """What the scale rests on, and the 1-sigma of all lengths due to the camera height and the focal length."""
+    """The source of the scale, and the 1-sigma of all lengths due to the camera height and the focal length."""
 
     words: str = "the height and lens of the camera, as the camera file or the recording states them"
     height_sigma_rel: float = 0.0
@@ -78,7 +78,7 @@ AS_STATED = LengthsBy()
 
 @dataclass(frozen=True, kw_only=True)
 class DriveCounts:
-    """The counts of one drive that the verdict is made of."""
+    """The input of the verdict: the counts of one drive."""
 
     frames: int
     invalid_frames: int
@@ -88,7 +88,7 @@ class DriveCounts:
     path_m: float
     valid_path_m: float
     scale_sigma_rel: float | None  # median of the valid frames
-    camera_sigma_rel: float  # its part due to camera height and lens
+    camera_sigma_rel: float  # the part due to camera height and lens
     lengths_by: LengthsBy = AS_STATED
     ends_unreadable: bool = False  # the last image is damaged or missing
 
@@ -152,10 +152,10 @@ def _next_steps(drive: DriveCounts) -> Iterable[str]:
         ),
     ]
     for sigma_rel, words in sorted(advice, reverse=True):  # the largest first
-        if sigma_rel > WORTH_MEASURING_REL:
+        if sigma_rel > MAX_SIGMA_REL:
             yield f"Next: {words}"
     for status, remedy in REMEDIES.items():
-        if drive.statuses.get(status.value, 0) > OFTEN * drive.frames:
+        if drive.statuses.get(status.value, 0) > MIN_REMEDY_SHARE * drive.frames:
             yield f"Remedy for {status.value}: {remedy}."
 
 

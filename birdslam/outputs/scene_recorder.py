@@ -1,4 +1,4 @@
-"""What the picture of a drive shows, collected as its estimates come; bounded in memory whatever its length."""
+"""Collects the content of the picture of a drive from its estimates, with bounded memory."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ MAX_POSES, MAX_TRACK_POSES, MAX_POINTS, MAX_TRACKS = 4000, 100, 20_000, 200  # u
 
 
 class Thinned:
-    """Rows of numbers, at most `keep` of them: past that, every second one goes, and every second one to come.
+    """At most `keep` rows of numbers. When it is full, it drops every second row and doubles its interval.
 
-    Room for `begin` rows is there from the start (None: for all), and doubles where that is not enough.
+    The buffer has room for `begin` rows at first (None: for all) and doubles when needed.
     """
 
     def __init__(self, width: int, keep: int, begin: int | None = None) -> None:
         self._keep = keep
-        self._rows = np.full((keep if begin is None else min(begin, keep), width), np.nan)  # written to: it is there
+        self._rows = np.full((keep if begin is None else min(begin, keep), width), np.nan)  # allocates the pages now
         self._kept = 0
         self._step = 1
         self._seen = 0
 
     def add(self, *row: float) -> None:
-        """Keep this row, or pass over it."""
+        """Keeps or skips this row."""
         if self._seen % self._step == 0:
             if self._kept >= self._keep:
                 left = self._rows[: self._kept : 2].copy()
@@ -44,7 +44,7 @@ class Thinned:
         self._seen += 1
 
     def array(self) -> Floats:
-        """(N, width) of the rows kept."""
+        """Returns the rows kept, (N, width)."""
         return self._rows[: self._kept].copy()
 
 
@@ -56,17 +56,17 @@ class _TrackHistory:
 
 
 class SceneRecorder:
-    """Puts the world of each epoch where the last one was left, so that one picture shows all of them."""
+    """Joins the worlds of all epochs in one picture: each epoch starts at the last pose of the previous one."""
 
     def __init__(self) -> None:
         self.T_picture_world = SE2()  # of the newest epoch
         self._last: Estimate | None = None
         self._ego, self._breaks = Thinned(3, MAX_POSES), Thinned(2, MAX_POSES)
         self._lanes, self._landmarks = Thinned(2, MAX_POINTS), Thinned(2, MAX_POINTS)
-        self._tracks: dict[int, tuple[_TrackHistory, RoadUser, SE2]] = {}  # with the last estimate, and where it is
+        self._tracks: dict[int, tuple[_TrackHistory, RoadUser, SE2]] = {}  # history, last estimate, pose in the picture
 
     def add(self, estimate: Estimate) -> None:
-        """One frame's estimate."""
+        """Adds the estimate of one frame."""
         if self._last is not None and self._last.epoch != estimate.epoch:
             T_picture_ego = self.T_picture_world @ self._last.T_world_ego
             self.T_picture_world = T_picture_ego @ estimate.T_world_ego.inverse()
@@ -78,7 +78,7 @@ class SceneRecorder:
                 self._add_track(estimate, user)
 
     def add_map(self, update: MapUpdate) -> None:
-        """Points of the newest epoch."""
+        """Adds map points of the newest epoch."""
         for points, kept in ((update.landmarks_m, self._landmarks), (update.lanes_m, self._lanes)):
             for x_m, y_m in self.T_picture_world @ np.array(points).reshape(-1, 2):
                 kept.add(float(x_m), float(y_m))
@@ -86,18 +86,18 @@ class SceneRecorder:
     def _add_track(self, estimate: Estimate, user: RoadUser) -> None:
         history = self._tracks.pop(user.vehicle)[0] if user.vehicle in self._tracks else _TrackHistory()
         placed = self.T_picture_world @ user.T_world_vehicle
-        self._tracks[user.vehicle] = history, user, placed  # the one seen last stands last
+        self._tracks[user.vehicle] = history, user, placed  # insertion order: the most recent is last
         if len(self._tracks) > MAX_TRACKS:
             del self._tracks[next(iter(self._tracks))]
         history.poses.add(*_numbers(placed))
         seen_from = estimate.T_world_ego.between(user.T_world_vehicle)
         history.farthest_m = max(history.farthest_m, math.hypot(seen_from.x_m, seen_from.y_m))
-        # A vehicle that is not reported to drive has a velocity too, by the error of its depth
+        # The depth error gives a stationary vehicle a velocity too
         reported = user.moves is Moves.DRIVING or user.label in PEOPLE
         history.speeds.add(math.hypot(*user.velocity_mps) if reported else 0.0)
 
     def scene(self, **known: Any) -> Scene:
-        """All of it; `known` are the other fields of the scene."""
+        """Returns the scene; `known` are its other fields."""
         tracks = [
             Track(
                 vehicle=vehicle,

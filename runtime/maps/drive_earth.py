@@ -21,7 +21,7 @@ from birdslam.loops.gnss.files import Track
 from birdslam.loops.keyframe import Link, Placed
 from birdslam.loops.keyframe_builder import SPACING_M
 from birdslam.loops.place_map import PlaceMap
-from birdslam.outputs.earth_files import SUFFIXES, Way, write_ways
+from birdslam.outputs.earth_files import SUFFIXES, GeoLine, write_geo_lines
 from birdslam.outputs.placed import Place
 from birdslam.runtime.maps.gnss_input import Fixes
 from birdslam.types import Estimate
@@ -66,9 +66,9 @@ def write_earth(
     degrees = found.earth.wgs84(np.array([(pose.x_m, pose.y_m) for pose in bent]))
     about = figures(found.earth, camera)
     properties = {key: value for key, value in about.items() if isinstance(value, int | float | str)}
-    line = Way("ego", degrees, t_ns.tolist(), properties)
+    line = GeoLine("ego", degrees, t_ns.tolist(), properties)
     for suffix in SUFFIXES:
-        write_ways(output / f"ego{suffix}", [line])
+        write_geo_lines(output / f"ego{suffix}", [line])
     if place_map is not None and len(place_map):
         place_map.georeference(found)
     return about, [

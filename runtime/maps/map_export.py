@@ -10,7 +10,7 @@ import numpy as np
 
 from birdslam.loops.map_file import MapError
 from birdslam.loops.place_map import PlaceMap
-from birdslam.outputs.earth_files import SUFFIXES, Way, write_ways
+from birdslam.outputs.earth_files import SUFFIXES, GeoLine, write_geo_lines
 from birdslam.trajectory import ego_pose, tum_row
 
 IN_METRES = ".map.geojson"  # in the map frame
@@ -28,17 +28,19 @@ def export_map(place_map: PlaceMap, path: Path) -> str:
             path.write_text("".join(f"{tum_row(*row)}\n" for row in rows), encoding="ascii")
             return f"{len(place_map)} keyframes"
         if path.suffix.lower() in SUFFIXES:
-            ways, lines = _ways(place_map), _lines(place_map)
+            trajectories, lines = _trajectories(place_map), _lines(place_map)
             if path.name.endswith(IN_METRES):
-                path.write_bytes(_in_metres([*ways, *lines]))
+                path.write_bytes(_in_metres([*trajectories, *lines]))
             elif place_map.earth is None:
                 raise MapError(
                     f"{path}: the map is not georeferenced; drive with --map and --gnss, or export {IN_METRES}"
                 )
             else:
                 earth = place_map.earth
-                write_ways(path, [replace(way, degrees=earth.wgs84(way.degrees)) for way in (*ways, *lines)])
-            return f"{len(ways)} trajectories and {len(lines)} lines"
+                write_geo_lines(
+                    path, [replace(line, degrees=earth.wgs84(line.degrees)) for line in (*trajectories, *lines)]
+                )
+            return f"{len(trajectories)} trajectories and {len(lines)} lines"
     except OSError as error:
         raise MapError(f"{path}: can't be written: {error.strerror}") from None
     raise MapError(f"{path}: a map is exported as {FORMATS}")
@@ -57,24 +59,24 @@ def _g2o(place_map: PlaceMap) -> list[str]:
     return out
 
 
-def _ways(place_map: PlaceMap) -> list[Way]:
+def _trajectories(place_map: PlaceMap) -> list[GeoLine]:
     """Returns the trajectories of the drives, in the map frame."""
     out = []
     for drive in range(place_map.drives):
         own = [each.T_map_keyframe for each in place_map.keyframes if each.drive == drive]
         if len(own) > 1:
             about: dict[str, float | int | str] = {"drive": drive, "keyframes": len(own)}
-            out.append(Way(f"drive {drive}", np.array([(T.x_m, T.y_m) for T in own]), about=about))
+            out.append(GeoLine(f"drive {drive}", np.array([(T.x_m, T.y_m) for T in own]), properties=about))
     return out
 
 
-def _lines(place_map: PlaceMap) -> list[Way]:
+def _lines(place_map: PlaceMap) -> list[GeoLine]:
     """Returns the lane lines, in the map frame."""
     return [
-        Way(
+        GeoLine(
             f"{each.kind.value} {each.line}",
             each.points_m,
-            about={
+            properties={
                 "drive": each.drive,
                 "line": each.line,
                 "kind": each.kind.value,
@@ -86,14 +88,14 @@ def _lines(place_map: PlaceMap) -> list[Way]:
     ]
 
 
-def _in_metres(ways: list[Way]) -> bytes:
+def _in_metres(lines: list[GeoLine]) -> bytes:
     features = [
         {
             "type": "Feature",
-            "geometry": {"type": "LineString", "coordinates": way.degrees.round(3).tolist()},
-            "properties": {"name": way.name, **(way.about or {})},
+            "geometry": {"type": "LineString", "coordinates": line.degrees.round(3).tolist()},
+            "properties": {"name": line.name, **(line.properties or {})},
         }
-        for way in ways
+        for line in lines
     ]
     collection = {"type": "FeatureCollection", "birdslam": {"metres_of": "the map"}, "features": features}
     return msgspec.json.encode(collection) + b"\n"

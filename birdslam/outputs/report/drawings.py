@@ -1,4 +1,4 @@
-"""What the report draws, as traces of plotly: the drive from above and on Earth, its speed, its statuses."""
+"""The plots of the report as plotly traces: the drive from above and on Earth, its speed and its statuses."""
 
 from __future__ import annotations
 
@@ -14,12 +14,17 @@ from birdslam.outputs.report.drive_table import DriveTable, EarthTable, TrackTab
 from birdslam.outputs.report.wording import frame_words, invalidates, status_names
 from birdslam.types import Status
 
-SMOOTHED_S = 0.5  # over which the speed that is drawn is a mean
+SPEED_WINDOW_S = 0.5  # of the moving average of the speed
 MAX_POINTS = 4000  # of a line
 MAX_TRACK_POINTS = 200
-# A frame is of the first of these that it fits
-KINDS = (("not valid", "#d1342f"), ("stands", "#8b95a5"), ("valid, with remarks", "#e0a100"), ("valid", "#1f9d6b"))
-# No remarks: networks look at some pictures alone, and their answers hold until the next
+# The kind of a frame is the first one that applies
+KINDS = (
+    ("not valid", "#d1342f"),
+    ("stationary", "#8b95a5"),
+    ("valid, with other statuses", "#e0a100"),
+    ("valid", "#1f9d6b"),
+)
+# Not reported as remarks: the networks run on a part of the frames by schedule
 BY_SCHEDULE = {each.value for each in (Status.DETECTIONS_CARRIED, Status.SEGMENTATION_CARRIED, Status.DEPTH_CARRIED)}
 TRACK_COLOURS = {"vehicles": "#5b7fd6", "people": "#c455b8"}
 LINE_COLOUR, LANDMARK_COLOUR = "#b48a00", "#8b95a5"
@@ -27,18 +32,18 @@ LINE_COLOUR, LANDMARK_COLOUR = "#b48a00", "#8b95a5"
 Trace = dict[str, Any]
 
 
-def thinned(count: int, most: int = MAX_POINTS) -> Ints:
-    """The rows that are drawn of so many."""
-    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
+def thinned(count: int, max_count: int = MAX_POINTS) -> Ints:
+    """Returns the indices of at most `max_count` of `count` rows, at equal intervals."""
+    return np.unique(np.linspace(0, count - 1, min(count, max_count)).astype(np.int64))
 
 
 def rounded(values: Floats, digits: int = 3) -> list[float | None]:
-    """For JSON, which knows no NaN."""
+    """Rounds values for JSON, with null for NaN."""
     return [round(float(value), digits) if np.isfinite(value) else None for value in values]
 
 
 def from_above(drive: DriveTable, shown: Ints) -> list[Trace]:
-    """In the plane: forward is up, left is to the left."""
+    """Returns the drive in the plane: x up, y left."""
     traces = [_points("road landmarks", *_up(drive.landmarks_m), LANDMARK_COLOUR, 2)]
     if drive.lines:
         traces.append(_broken_line("lines", [_up(xy_m) for _, xy_m in drive.lines], LINE_COLOUR, 2.0))
@@ -47,29 +52,31 @@ def from_above(drive: DriveTable, shown: Ints) -> list[Trace]:
     for kind, people in (("vehicles", False), ("people", True)):
         own = [track for track in drive.tracks if track.is_person is people]
         traces += [_track(track, kind, first=track is own[0]) for track in own]
-    return [trace for trace in (*traces, *_own_way(drive, shown, *_up(drive.xy_m[shown]))) if len(trace["x"])]
+    return [trace for trace in (*traces, *_ego_path(drive, shown, *_up(drive.xy_m[shown]))) if len(trace["x"])]
 
 
 def on_earth(drive: DriveTable, earth: EarthTable, shown: Ints) -> list[Trace]:
-    """North is up; longitude and latitude in degrees."""
-    ways = (("road lines", earth.road_deg, LINE_COLOUR), ("others' ways", earth.tracks_deg, TRACK_COLOURS["vehicles"]))
-    traces = [_broken_line(name, [_east(way) for way in some], colour, 1.5, 7) for name, some, colour in ways if some]
-    return [*traces, *_own_way(drive, shown, *_east(earth.at(drive.t_s[shown])), digits=7)]
+    """Returns the drive in longitude and latitude in degrees, north up."""
+    kinds = (("road lines", earth.road_deg, LINE_COLOUR), ("vehicles", earth.tracks_deg, TRACK_COLOURS["vehicles"]))
+    traces = [
+        _broken_line(name, [_east(line) for line in lines], colour, 1.5, 7) for name, lines, colour in kinds if lines
+    ]
+    return [*traces, *_ego_path(drive, shown, *_east(earth.at(drive.t_s[shown])), digits=7)]
 
 
-def stretch(earth: EarthTable) -> float:
-    """How many degrees of longitude are as long as one of latitude."""
+def aspect_ratio(earth: EarthTable) -> float:
+    """Returns the length of a degree of latitude over that of a degree of longitude."""
     return 1.0 / math.cos(math.radians(float(earth.degrees[0, 0])))
 
 
 def speeds(drive: DriveTable, shown: Ints) -> list[Trace]:
-    """The speed with its sigma; what may not be driven by in red."""
+    """Returns the speed with its sigma; invalid frames are red."""
     speed, t_s = smoothed_speed(drive)[shown], drive.t_s[shown]
     sigma = speed * drive.scale_sigma_rel[shown]
-    sure = drive.valid[shown] & np.isfinite(speed)
-    # A closed outline of each stretch: a band between two lines would be drawn across what lies between stretches
+    is_valid = drive.valid[shown] & np.isfinite(speed)
+    # One closed outline per interval: plotly would fill a band between two lines across the gaps
     x, y = [], []
-    for begin, end in drive.stretches(sure):
+    for begin, end in drive.intervals(is_valid):
         span = slice(begin, end)
         x += [t_s[span], t_s[span][::-1], [np.nan]]
         y += [(speed + sigma)[span], (speed - sigma)[span][::-1], [np.nan]]
@@ -85,18 +92,18 @@ def speeds(drive: DriveTable, shown: Ints) -> list[Trace]:
             "fillcolor": "rgba(31,157,107,0.25)",
             "name": "1 sigma",
         },
-        _speed_line("speed", t_s, np.where(sure, speed, np.nan), KINDS[3][1]),
-        _speed_line("not valid", t_s, np.where(sure, np.nan, speed), KINDS[0][1]),
+        _speed_line("speed", t_s, np.where(is_valid, speed, np.nan), KINDS[3][1]),
+        _speed_line("not valid", t_s, np.where(is_valid, np.nan, speed), KINDS[0][1]),
     ]
 
 
 def statuses(drive: DriveTable) -> list[Trace]:
-    """A bar over the time of each status, those that make a frame invalid in red."""
+    """Returns a bar over time for each status; invalidating ones are red."""
     traces = []
     for name in status_names(drive):
-        held = np.array([name in here for here in drive.statuses])
+        is_set = np.array([name in here for here in drive.statuses])
         x: list[float | None] = []
-        for begin, end in drive.stretches(held):
+        for begin, end in drive.intervals(is_set):
             x += [round(float(drive.t_s[begin]), 2), round(float(drive.t_s[end - 1] + drive.step_s), 2), None]
         words = html.escape(f"{name}: {meaning(name)}")
         traces.append(
@@ -115,8 +122,8 @@ def statuses(drive: DriveTable) -> list[Trace]:
 
 
 def smoothed_speed(drive: DriveTable) -> Floats:
-    """(N,) the mean over SMOOTHED_S, of frames that have one."""
-    window = np.ones(max(1, round(SMOOTHED_S / max(drive.step_s, 1e-3))))
+    """Returns the moving average (N,) over SPEED_WINDOW_S of the known speeds."""
+    window = np.ones(max(1, round(SPEED_WINDOW_S / max(drive.step_s, 1e-3))))
     known = np.isfinite(drive.speed_mps)
     total = np.convolve(np.where(known, drive.speed_mps, 0.0), window, mode="same")[: len(known)]
     count = np.convolve(known.astype(np.float64), window, mode="same")[: len(known)]
@@ -125,7 +132,7 @@ def smoothed_speed(drive: DriveTable) -> Floats:
 
 
 def _up(xy_m: Floats) -> tuple[Floats, Floats]:
-    """Ahead and left as a picture's right and up."""
+    """Converts x and y to the right and up axes of the picture."""
     return -xy_m[:, 1], xy_m[:, 0]
 
 
@@ -133,14 +140,14 @@ def _east(degrees: Floats) -> tuple[Floats, Floats]:
     return degrees[:, 1], degrees[:, 0]
 
 
-def _own_way(drive: DriveTable, shown: Ints, right: Floats, up: Floats, digits: int = 3) -> list[Trace]:
-    """Coloured by what holds there."""
+def _ego_path(drive: DriveTable, shown: Ints, right: Floats, up: Floats, digits: int = 3) -> list[Trace]:
+    """Returns the ego trajectory, coloured by the kind of each frame."""
     kinds, traces = np.array([_kind(drive, k) for k in shown]), []
     for number, (name, colour) in enumerate(KINDS):
         here = kinds == number
         if here.any():
             words = {"text": [frame_words(drive, k) for k in shown[here]], "hoverinfo": "text"}
-            traces.append(_points(f"own way: {name}", right[here], up[here], colour, 6, digits) | words)
+            traces.append(_points(f"ego: {name}", right[here], up[here], colour, 6, digits) | words)
     return traces
 
 
@@ -164,11 +171,11 @@ def _points(name: str, right: Floats, up: Floats, colour: str, size: int, digits
     }
 
 
-def _broken_line(name: str, ways: list[tuple[Floats, Floats]], colour: str, width: float, digits: int = 3) -> Trace:
-    """Many lines as one trace, with gaps between them."""
+def _broken_line(name: str, lines: list[tuple[Floats, Floats]], colour: str, width: float, digits: int = 3) -> Trace:
+    """Returns many lines as one trace, with gaps between them."""
     x: list[float | None] = []
     y: list[float | None] = []
-    for right, up in ways:
+    for right, up in lines:
         x += [*rounded(right, digits), None]
         y += [*rounded(up, digits), None]
     line = {"color": colour, "width": width}

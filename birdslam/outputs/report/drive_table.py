@@ -1,4 +1,4 @@
-"""A drive's results as its directory has them, for the report: frames, tracks and map in one plane."""
+"""Reads the results of a drive for the report: frames, tracks and map in one plane."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ from birdslam.outputs.drive_files import FRAME_COLUMNS, FRAMES_FILE, ResultsErro
 from birdslam.outputs.placed import PLACES_FILE
 
 PEOPLE = frozenset({"pedestrian", "person", "cyclist", "rider", "bicycle"})
-FILES = {  # what the page hands out, where it is there
-    "ego.tum.txt": "the ego's way, TUM lines",
-    "ego.kitti.txt": "the ego's way, KITTI rows",
-    "ego.final.tum.txt": "smoothed, TUM lines",
-    "map.tum.txt": "the way in the map, TUM lines",
-    "ego.gpx": "the way on Earth, GPX",
-    "ego.geojson": "the way on Earth, GeoJSON",
-    "frames.csv": "a line a frame",
-    "map.geojson": "the road's lines",
-    "road.geojson": "the road's lines on Earth, GeoJSON",
-    "tracks.geojson": "other vehicles' ways on Earth, GeoJSON",
+FILES = {  # downloads of the page
+    "ego.tum.txt": "ego trajectory, TUM format",
+    "ego.kitti.txt": "camera poses, KITTI format",
+    "ego.final.tum.txt": "final ego trajectory, TUM format",
+    "map.tum.txt": "trajectory in the map, TUM format",
+    "ego.gpx": "trajectory on Earth, GPX",
+    "ego.geojson": "trajectory on Earth, GeoJSON",
+    "frames.csv": "position, speed, sigma and statuses of each frame",
+    "map.geojson": "lane lines and road edges",
+    "road.geojson": "lane lines and road edges on Earth, GeoJSON",
+    "tracks.geojson": "trajectories of other vehicles on Earth, GeoJSON",
 }
-MAX_FILE_BYTES = 1_500_000  # of one that the page holds
-MAX_TRACKS, FEWEST_ROWS = 150, 5  # a track of fewer frames is mostly a false alarm
+MAX_FILE_BYTES = 1_500_000  # larger files are not in the page
+MAX_TRACKS, MIN_TRACK_ROWS = 150, 5  # a shorter track is mostly a false alarm
 MAX_MAP_POINTS = 6000
-MAX_WAYS = 400  # on Earth, of lines and of vehicles
+MAX_EARTH_LINES = 400  # road lines, and tracks
 
 
 @dataclass(frozen=True)
 class TrackTable:
-    """One road user: its number and class, times (N,) in s and places (N, 2) in the plane."""
+    """One road user: number and class, times (N,) in s and positions (N, 2) in the plane."""
 
     name: str
     label: str
@@ -52,9 +52,7 @@ class TrackTable:
 
 @dataclass(frozen=True)
 class EarthTable:
-    """The drive on Earth: times (K,) in s with latitude and longitude (K, 2) in degrees; ways (M, 2) of what is beside
-    it.
-    """
+    """The drive on Earth: times (K,) in s, latitude and longitude (K, 2) in degrees, lines (M, 2)."""
 
     t_s: Floats
     degrees: Floats
@@ -62,15 +60,15 @@ class EarthTable:
     tracks_deg: list[Floats]
 
     def at(self, t_s: Floats) -> Floats:
-        """(N, 2) latitude and longitude at these times."""
+        """Interpolates latitude and longitude (N, 2) at these times."""
         return np.column_stack([np.interp(t_s, self.t_s, column) for column in self.degrees.T])
 
 
 @dataclass(frozen=True)
 class DriveTable:
-    """Of each frame: its number, time in s, place (N, 2), heading, speed, 1-sigma of a metre, validity, statuses.
+    """Per frame: number, time in s, position (N, 2), heading, speed, scale sigma, validity and statuses.
 
-    The plane is the world of the first epoch; where an epoch begins, it begins where the one before was left.
+    The plane is the world of the first epoch. Each epoch starts at the last pose of the previous one.
     """
 
     name: str
@@ -78,38 +76,38 @@ class DriveTable:
     t_s: Floats
     xy_m: Floats
     yaw_rad: Floats
-    speed_mps: Floats  # NaN where an epoch begins
+    speed_mps: Floats  # NaN at the start of an epoch
     scale_sigma_rel: Floats
     valid: Bools
     statuses: list[tuple[str, ...]]
     tracks: list[TrackTable]
     lanes_m: Floats  # (M, 2)
-    lines: list[tuple[str, Floats]]  # kind of each of the road's lines, and its vertices (K, 2)
-    earth: EarthTable | None  # None: no GNSS was there
-    files: dict[str, str]  # text of those of FILES that are there
+    lines: list[tuple[str, Floats]]  # kind and vertices (K, 2) of each line
+    earth: EarthTable | None  # None without GNSS
+    files: dict[str, str]  # text of the existing FILES
     landmarks_m: Floats
     summary: dict[str, Any]
-    camera: str  # as a camera file has it; "": it is not known
+    camera: str  # in the format of a camera file; "": unknown
 
     @property
     def step_s(self) -> float:
-        """Between two frames, in the median."""
+        """The median interval between two frames."""
         return float(np.median(np.diff(self.t_s))) if len(self.t_s) > 1 else 0.1
 
-    def stretches(self, held: Bools) -> list[tuple[int, int]]:
-        """From which frame to before which one something holds without a break; `held` is (N,)."""
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], held, [False]])))
+    def intervals(self, is_set: Bools) -> list[tuple[int, int]]:
+        """Returns begin and end (exclusive) of each run of true values in `is_set` (N,)."""
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], is_set, [False]])))
         return [(int(begin), int(end)) for begin, end in edges.reshape(-1, 2)]
 
 
 def read_drive(directory: Path) -> DriveTable:
-    """The results in a directory of `birdslam run`. Raises ResultsError where they are none, or torn."""
+    """Reads an output directory of `birdslam run`. Raises ResultsError if results are missing or damaged."""
     try:
         summary = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
         with (directory / FRAMES_FILE).open(encoding="utf-8", newline="") as file:
             rows = list(csv.DictReader(file))
         if not rows or tuple(rows[0]) != FRAME_COLUMNS:
-            raise ResultsError(f"{directory / FRAMES_FILE}: holds no frames")
+            raise ResultsError(f"{directory / FRAMES_FILE}: has no frames")
         numbers = np.array([[float(row[name] or "nan") for name in FRAME_COLUMNS[:9]] for row in rows])
         to_plane = _epochs(numbers)
         poses = [to_plane[int(row[2])] @ SE2(*row[3:6]) for row in numbers]
@@ -139,11 +137,11 @@ def read_drive(directory: Path) -> DriveTable:
     except OSError as error:
         raise ResultsError(f"{directory}: {error.strerror}: {error.filename}") from None
     except (ValueError, KeyError, TypeError) as error:
-        raise ResultsError(f"{directory}: its results are torn: {error}") from None
+        raise ResultsError(f"{directory}: the results are damaged: {error}") from None
 
 
 def _epochs(numbers: Floats) -> dict[int, SE2]:
-    """Of each epoch its world in the plane: its first pose lies on the last one of the epoch before."""
+    """Returns the transform from the world of each epoch to the plane."""
     out: dict[int, SE2] = {}
     last = SE2()
     for row in numbers:
@@ -185,20 +183,20 @@ def _earth(directory: Path, begin_s: float) -> EarthTable | None:
     if not rows:
         return None
     table = np.array([[float(row[name]) for name in ("t_s", "latitude_deg", "longitude_deg")] for row in rows])
-    road, tracks = (_ways(directory / f"{name}.geojson") for name in ("road", "tracks"))
+    road, tracks = (_earth_lines(directory / f"{name}.geojson") for name in ("road", "tracks"))
     return EarthTable(table[:, 0] - begin_s, table[:, 1:], road, tracks)
 
 
-def _ways(path: Path) -> list[Floats]:
-    """(M, 2) latitude and longitude of each line of a GeoJSON file."""
+def _earth_lines(path: Path) -> list[Floats]:
+    """Reads latitude and longitude (M, 2) of each line of a GeoJSON file."""
     if not path.is_file():
         return []
     features = json.loads(path.read_text(encoding="utf-8"))["features"]
-    return [np.array(each["geometry"]["coordinates"], np.float64)[:, ::-1] for each in features[:MAX_WAYS]]
+    return [np.array(each["geometry"]["coordinates"], np.float64)[:, ::-1] for each in features[:MAX_EARTH_LINES]]
 
 
 def _camera(path: Path, summary: dict[str, Any]) -> str:
-    """The camera file that the drive wrote, or what its configuration has."""
+    """Returns the camera file of the drive, or the camera of its configuration."""
     if path.is_file():
         return path.read_text(encoding="utf-8")
     configuration = summary.get("configuration")
@@ -232,5 +230,5 @@ def _tracks(directory: Path, to_plane: dict[int, SE2], begin_s: float) -> Iterat
                 placed = to_plane[epoch] @ SE2(x, y, 0.0)
                 t_s.append(t - begin_s)
                 xy_m.append((placed.x_m, placed.y_m))
-        if len(t_s) >= FEWEST_ROWS:
+        if len(t_s) >= MIN_TRACK_ROWS:
             yield TrackTable(path.name.removesuffix(".tum.txt"), label, np.array(t_s), np.array(xy_m))

@@ -7,8 +7,8 @@ const dark = window.matchMedia("(prefers-color-scheme: dark)");
 const config = { responsive: true, displaylogo: false, scrollZoom: true };
 const ring = { name: "now", type: "scatter", mode: "markers", hoverinfo: "skip",
   marker: { size: 15, symbol: "circle-open", line: { width: 3 }, color: "#e8487f" } };
-// The places of which each has a ring that moves along, and the traces below it
-const ways = { map: { x: data.x, y: data.y, traces: data.map }, ...(data.earth ? { earth: data.earth } : {}) };
+// The plots with a ring at the current frame
+const plots = { map: { x: data.x, y: data.y, traces: data.map }, ...(data.earth ? { earth: data.earth } : {}) };
 
 const below = { orientation: "h", yref: "container", y: 0, yanchor: "bottom" };
 
@@ -25,11 +25,11 @@ function layout(more) {
 }
 
 const last = data.t[data.t.length - 1];
-const moment = (t) => [{ type: "line", x0: t, x1: t, yref: "paper", y0: 0, y1: 1,
+const cursor = (t) => [{ type: "line", x0: t, x1: t, yref: "paper", y0: 0, y1: 1,
   line: { color: "#e8487f", width: 2 } }];
 
-function drawWay(name, title, right, up, scaleratio, more) {
-  const { x, y, traces } = ways[name];
+function drawPlot(name, title, right, up, scaleratio, more) {
+  const { x, y, traces } = plots[name];
   const here = { ...ring, x: [x[slider.value]], y: [y[slider.value]] };
   Plotly.react(name, [...traces, here], layout({ title, legend: below, ...more.around,
     xaxis: { title: { text: right }, ...more.axis },
@@ -38,31 +38,31 @@ function drawWay(name, title, right, up, scaleratio, more) {
 
 function draw() {
   const time = { title: { text: "time (s)" }, range: [0, last] };
-  // Room for a legend of several lines from the start: plotly does not always find it by itself
+  // Reserve room for a legend of several rows: plotly does not always do so
   const low = document.getElementById("map").clientWidth < 800 ? 120 : 80;
-  drawWay("map", "from above", "right of the start (m)", "ahead of the start (m)", 1,
+  drawPlot("map", "from above", "right of the start (m)", "ahead of the start (m)", 1,
     { around: { margin: { l: 60, r: 15, t: 40, b: low } } });
   if (data.earth) {
-    // Degrees are as wide in every drive; margins that fit themselves to them do not settle on a narrow screen
-    drawWay("earth", "north is up, colours as above", "longitude (deg)", "latitude (deg)", data.earth.stretch,
+    // Fixed margins: automatic ones oscillate on a narrow screen
+    drawPlot("earth", "north is up, colours as above", "longitude (deg)", "latitude (deg)", data.earth.aspect_ratio,
       { around: { showlegend: false, margin: { l: 90, r: 15, t: 40, b: 50 } },
         axis: { tickformat: ".4f", nticks: 5, automargin: false } });
   }
   Plotly.react("speed", data.speeds, layout({
     title: "speed (m/s)", legend: below,
-    xaxis: time, yaxis: { rangemode: "tozero" }, shapes: moment(data.t[slider.value]) }), config);
+    xaxis: time, yaxis: { rangemode: "tozero" }, shapes: cursor(data.t[slider.value]) }), config);
   Plotly.react("statuses", data.statuses, layout({
-    title: "statuses", xaxis: time, shapes: moment(data.t[slider.value]),
+    title: "statuses", xaxis: time, shapes: cursor(data.t[slider.value]),
     yaxis: { automargin: true, autorange: "reversed", type: "category" } }), config);
 }
 
 function move() {
   const k = Number(slider.value);
   words.textContent = new DOMParser().parseFromString(data.words[k], "text/html").documentElement.textContent;
-  for (const [name, { x, y, traces }] of Object.entries(ways)) {
+  for (const [name, { x, y, traces }] of Object.entries(plots)) {
     Plotly.restyle(name, { x: [[x[k]]], y: [[y[k]]] }, [traces.length]);
   }
-  for (const name of ["speed", "statuses"]) Plotly.relayout(name, { shapes: moment(data.t[k]) });
+  for (const name of ["speed", "statuses"]) Plotly.relayout(name, { shapes: cursor(data.t[k]) });
   if (picture && data.pictures.length) {
     let at = 0;
     while (at + 1 < data.pictures.length && data.pictures[at + 1].t <= data.t[k]) at += 1;
@@ -76,13 +76,13 @@ dark.addEventListener("change", draw);
 document.getElementById("statuses").style.height = `${160 + 26 * Math.max(1, data.statuses.length)}px`;
 draw();
 move();
-for (const name of [...Object.keys(ways), "speed"]) {
+for (const name of [...Object.keys(plots), "speed"]) {
   document.getElementById(name).on("plotly_click", (event) => {
     const point = event.points[0];
     let best = 0;
     data.t.forEach((t, k) => {
       const far = (i) => name === "speed" ? Math.abs(data.t[i] - point.x)
-        : Math.hypot(ways[name].x[i] - point.x, ways[name].y[i] - point.y);
+        : Math.hypot(plots[name].x[i] - point.x, plots[name].y[i] - point.y);
       if (far(k) < far(best)) best = k;
     });
     slider.value = String(best);

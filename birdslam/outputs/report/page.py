@@ -1,6 +1,6 @@
-"""The report as one page of HTML: the drive from above, its speed, its statuses, its pictures, all on one slider.
+"""Writes the report as one HTML page: the drive from above, speed, statuses and pictures, with one slider.
 
-By plotly, whose JavaScript is in the page, so that it opens offline. Whatever comes from a file is escaped.
+The page contains the JavaScript of plotly, so that it opens offline. All text from files is escaped.
 """
 
 from __future__ import annotations
@@ -17,30 +17,30 @@ from birdslam.outputs.report import drawings, wording
 from birdslam.outputs.report.drawings import rounded
 from birdslam.outputs.report.drive_table import DriveTable
 
-REPORT = "report.html"  # beside the results
+REPORT = "report.html"
 STYLE, SCRIPT = (Path(__file__).parent / name for name in ("page.css", "page.js"))
-PICTURES, PICTURE_WIDTH_PX, JPEG_QUALITY = 150, 900, 68  # of the video, some 6 MB
+MAX_PICTURES, PICTURE_WIDTH_PX, JPEG_QUALITY = 150, 900, 68  # of the video, about 6 MB
 
 
 def plotly_script() -> str:
-    """plotly's own text. Raises ResultsError where it is not installed."""
+    """Returns the JavaScript of plotly. Raises ResultsError if plotly is not installed."""
     try:
         from plotly.offline import get_plotlyjs
     except ImportError:
-        raise ResultsError("a report needs the extra `report`: pip install 'birdslam[report]'") from None
+        raise ResultsError("a report needs plotly: pip install 'birdslam[report]'") from None
     return str(get_plotlyjs())
 
 
 def report_page(drive: DriveTable, video: Path | None = None, plotly: str = "") -> str:
-    """The whole page. `video` is that of `--video`, of which pictures are taken.
+    """Returns the page. Its pictures are from `video`, the file of `--video`.
 
-    `plotly` is the address of its text where many pages share one file; "": it is in the page. Raises ResultsError
-    where plotly is not installed.
+    `plotly` is the URL of a JavaScript file that several pages share; "" puts the script into the page. Raises
+    ResultsError if plotly is not installed.
     """
     script = f'<script src="{html.escape(plotly)}"></script>' if plotly else f"<script>{plotly_script()}</script>"
     pictures = _pictures(video) if video is not None and video.is_file() else []
     name = html.escape(drive.name)
-    film = '<figure id="film"><img id="picture" alt="the film at this moment"></figure>' if pictures else ""
+    film = '<figure id="film"><img id="picture" alt="video frame at this time"></figure>' if pictures else ""
     return "\n".join(
         (
             "<!doctype html>",
@@ -48,9 +48,9 @@ def report_page(drive: DriveTable, video: Path | None = None, plotly: str = "") 
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
             f"<style>{STYLE.read_text(encoding='utf-8')}</style></head><body>",
             f"<header><h1>{name}</h1><p>{wording.facts(drive)}</p></header>",
-            f'<section class="verdict"><h2>How far to believe it</h2><ul>{wording.verdict(drive)}</ul></section>',
+            f'<section class="verdict"><h2>Validity and accuracy</h2><ul>{wording.verdict(drive)}</ul></section>',
             f'<main><section id="map" class="plot"></section>{film}</main>',
-            '<section class="slider"><input id="at" type="range" min="0" step="1" value="0" aria-label="moment">'
+            '<section class="slider"><input id="at" type="range" min="0" step="1" value="0" aria-label="time">'
             '<output id="words"></output></section>',
             '<section id="speed" class="plot low"></section><section id="statuses" class="plot low"></section>',
             *_sections(drive),
@@ -62,14 +62,14 @@ def report_page(drive: DriveTable, video: Path | None = None, plotly: str = "") 
 
 
 def _sections(drive: DriveTable) -> list[str]:
-    """Below the plots: a heading and what stands under it."""
-    out = [("Frames that may not be driven by", _table(wording.invalid_rows(drive)))]
-    out.append(("What the statuses mean", _table(wording.status_rows(drive))))
+    """Returns the sections below the plots."""
+    out = [("Invalid frames", _table(wording.invalid_rows(drive)))]
+    out.append(("Statuses", _table(wording.status_rows(drive))))
     if drive.summary.get("stages_ms"):
-        out.append(("How long it took, capture to planner", _table(wording.latency_rows(drive))))
+        out.append(("Latency, capture to planner", _table(wording.latency_rows(drive))))
     if drive.earth is not None:
         out.append(("On Earth", wording.earth_words(drive, drive.earth) + '<div id="earth" class="plot"></div>'))
-    out.append(("To take away", f'<p class="files">{wording.downloads(drive)}</p>'))
+    out.append(("Downloads", f'<p class="files">{wording.downloads(drive)}</p>'))
     out.append(("Camera and versions", wording.details(drive)))
     return [f"<section><h2>{heading}</h2>{text}</section>" for heading, text in out]
 
@@ -79,11 +79,11 @@ def _table(rows: str) -> str:
 
 
 def _data(drive: DriveTable, pictures: list[tuple[float, str]]) -> dict[str, object]:
-    """What the script draws and moves."""
+    """Returns the data of page.js."""
     shown = drawings.thinned(len(drive.t_s))
     data: dict[str, object] = {
         "t": rounded(drive.t_s[shown]),
-        "x": rounded(-drive.xy_m[shown, 1]),  # forward is up, left is to the left
+        "x": rounded(-drive.xy_m[shown, 1]),  # picture axes: x up, y left
         "y": rounded(drive.xy_m[shown, 0]),
         "words": [wording.frame_words(drive, k) for k in shown],
         "map": drawings.from_above(drive, shown),
@@ -97,16 +97,16 @@ def _data(drive: DriveTable, pictures: list[tuple[float, str]]) -> dict[str, obj
             "x": rounded(at[:, 1], 7),
             "y": rounded(at[:, 0], 7),
             "traces": drawings.on_earth(drive, drive.earth, shown),
-            "stretch": round(drawings.stretch(drive.earth), 5),
+            "aspect_ratio": round(drawings.aspect_ratio(drive.earth), 5),
         }
     return data
 
 
 def _pictures(video: Path) -> list[tuple[float, str]]:
-    """(time in s, JPEG as base64) of pictures evenly over the video: not every browser plays its codec."""
+    """Returns (time in s, JPEG as base64) of pictures at equal intervals. Not every browser plays the codec."""
     capture = cv2.VideoCapture(str(video))
     count, hz = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), capture.get(cv2.CAP_PROP_FPS)
-    every, out, number = max(1, -(-count // PICTURES)), [], 0
+    every, out, number = max(1, -(-count // MAX_PICTURES)), [], 0
     while capture.grab():
         if number % every == 0:
             ok, image = capture.retrieve()
@@ -121,6 +121,6 @@ def _pictures(video: Path) -> list[tuple[float, str]]:
 
 
 def _json(data: object) -> str:
-    """Inside a script element: nothing in it ends the element or begins a comment."""
+    """Encodes data for a script element: without characters that end the element or begin a comment."""
     text = json.dumps(data, allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")

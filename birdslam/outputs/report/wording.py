@@ -1,7 +1,4 @@
-"""What the report says: of each frame, of those that are not valid, of statuses, latencies, camera and versions.
-
-All of it is HTML; whatever comes from a file is escaped.
-"""
+"""The texts of the report as HTML: frames, statuses, latencies, camera and versions. Text from files is escaped."""
 
 from __future__ import annotations
 
@@ -14,20 +11,22 @@ from birdslam.outputs.plain_words import MEANINGS, meaning
 from birdslam.outputs.report.drive_table import FILES, DriveTable, EarthTable
 from birdslam.types import INVALIDATING, Status
 
-MAX_STRETCHES = 40  # of frames that are not valid
+MAX_INTERVALS = 40  # of frames that are not valid
 
 
 def frame_words(drive: DriveTable, k: int) -> str:
-    """Of one frame, for a person."""
+    """Returns the description of one frame."""
     speed = drive.speed_mps[k]
     speed_text = "" if np.isnan(speed) else f", {speed:.1f} m/s (+- {drive.scale_sigma_rel[k]:.0%})"
-    said = "; ".join(meaning(name) for name in drive.statuses[k])
+    meanings = "; ".join(meaning(name) for name in drive.statuses[k])
     state = "valid" if drive.valid[k] else "NOT VALID"
-    return html.escape(f"{drive.t_s[k]:.1f} s, frame {drive.frame[k]}{speed_text}: {state}{'; ' if said else ''}{said}")
+    return html.escape(
+        f"{drive.t_s[k]:.1f} s, frame {drive.frame[k]}{speed_text}: {state}{'; ' if meanings else ''}{meanings}"
+    )
 
 
 def facts(drive: DriveTable) -> str:
-    """Source, frames, time and way."""
+    """Returns source, frame count, duration and distance."""
     source = html.escape(str(drive.summary.get("source", "")))
     return (
         f"{source}<br>{len(drive.t_s)} frames, {drive.t_s[-1]:.1f} s, {float(drive.summary.get('path_m', 0.0)):.0f} m"
@@ -35,46 +34,46 @@ def facts(drive: DriveTable) -> str:
 
 
 def verdict(drive: DriveTable) -> str:
-    """How far to believe it, a line a sentence."""
+    """Returns the verdict as list items."""
     lines = drive.summary.get("verdict")
     return "".join(f"<li>{html.escape(str(line))}</li>" for line in (lines if isinstance(lines, list) else ()))
 
 
 def status_names(drive: DriveTable) -> list[str]:
-    """The statuses of the drive, those that make a frame invalid first."""
+    """Returns the statuses of the drive, invalidating ones first."""
     there = {name for statuses in drive.statuses for name in statuses}
     return sorted(there, key=lambda name: (not invalidates(name), name))
 
 
 def invalidates(name: str) -> bool:
-    """Whether a frame of this status may not be driven by."""
+    """Whether a frame with this status is invalid."""
     return Status(name) in INVALIDATING
 
 
 def status_rows(drive: DriveTable) -> str:
-    """A row a status: its frames, its effect, its meaning."""
+    """Returns a table row per status: frames, effect, meaning."""
     rows = []
     for name in status_names(drive):
         count = sum(name in statuses for statuses in drive.statuses)
         effect = "not valid" if invalidates(name) else "reported only"
         words = html.escape(MEANINGS[Status(name)])
         rows.append(f"<tr><td>{html.escape(name)}</td><td>{_frames(count)}</td><td>{effect}</td><td>{words}</td></tr>")
-    return "".join(rows) or "<tr><td>none: all is well</td></tr>"
+    return "".join(rows) or "<tr><td>none</td></tr>"
 
 
 def invalid_rows(drive: DriveTable) -> str:
-    """A row a stretch of frames that may not be driven by: when, how many, and why."""
-    stretches, rows = drive.stretches(~drive.valid), []
-    for begin, end in stretches[:MAX_STRETCHES]:
+    """Returns a table row per interval of invalid frames: time, count, reasons."""
+    intervals, rows = drive.intervals(~drive.valid), []
+    for begin, end in intervals[:MAX_INTERVALS]:
         why = dict.fromkeys(name for here in drive.statuses[begin:end] for name in here if invalidates(name))
         when = f"{drive.t_s[begin]:.1f} to {drive.t_s[end - 1] + drive.step_s:.1f} s"
-        reason = html.escape("; ".join(map(meaning, why)) or "before anything is known")
+        reason = html.escape("; ".join(map(meaning, why)) or "not initialized")
         rows.append(f"<tr><td>{when}</td><td>{_frames(end - begin)}</td><td>{reason}</td></tr>")
-    if len(stretches) > MAX_STRETCHES:
-        left = int(sum(end - begin for begin, end in stretches[MAX_STRETCHES:]))
-        rest = f"{len(stretches) - MAX_STRETCHES} more such stretches: frames.csv has them"
+    if len(intervals) > MAX_INTERVALS:
+        left = int(sum(end - begin for begin, end in intervals[MAX_INTERVALS:]))
+        rest = f"{len(intervals) - MAX_INTERVALS} more intervals, see frames.csv"
         rows.append(f"<tr><td>later</td><td>{_frames(left)}</td><td>{rest}</td></tr>")
-    return "".join(rows) or "<tr><td>none: each frame is valid</td></tr>"
+    return "".join(rows) or "<tr><td>none</td></tr>"
 
 
 def _frames(count: int) -> str:
@@ -82,26 +81,26 @@ def _frames(count: int) -> str:
 
 
 def latency_rows(drive: DriveTable) -> str:
-    """A row a stage with its bar: p50 dark, to p99 light, by the longest p99."""
+    """Returns a table row per stage, with a bar up to p50 (dark) and p99 (light) relative to the largest p99."""
     stages, age = drive.summary["stages_ms"], drive.summary.get("age_ms") or {}
-    rows = {str(name): one for name, one in stages.items() if isinstance(one, dict)} | {"in all": age}
-    most = max((float(one.get("p99", 0.0)) for one in rows.values()), default=0.0) or 1.0
+    rows = {str(name): one for name, one in stages.items() if isinstance(one, dict)} | {"total": age}
+    largest = max((float(one.get("p99", 0.0)) for one in rows.values()), default=0.0) or 1.0
     out = []
     for name, one in rows.items():
         p50, p99 = float(one.get("p50", 0.0)), float(one.get("p99", 0.0))
-        bar = f'<i style="width:{p99 / most:.1%}"><b style="width:{p50 / (p99 or 1.0):.1%}"></b></i>'
+        bar = f'<i style="width:{p99 / largest:.1%}"><b style="width:{p50 / (p99 or 1.0):.1%}"></b></i>'
         words = f"p50 {p50:.1f}, p99 {p99:.1f} ms"
         out.append(f'<tr><td>{html.escape(name)}</td><td>{words}</td><td class="bar">{bar}</td></tr>')
     return "".join(out)
 
 
 def earth_words(drive: DriveTable, earth: EarthTable) -> str:
-    """From where to where, and how well the fixes fit."""
+    """Returns start and end positions and the fit of the GNSS fixes."""
     (lat, lon), (to_lat, to_lon) = earth.degrees[0], earth.degrees[-1]
-    said = drive.summary.get("earth", {})
-    fit_of = said if isinstance(said, dict) else {}
+    entry = drive.summary.get("earth", {})
+    fit_of = entry if isinstance(entry, dict) else {}
     fit = (
-        f"; {fit_of['fixes']} fixes, {fit_of['outliers']} left out, RMS {fit_of['rms_m']} m"
+        f"; {fit_of['fixes']} fixes, {fit_of['outliers']} outliers, RMS {fit_of['rms_m']} m"
         if "rms_m" in fit_of
         else ""
     )
@@ -109,7 +108,7 @@ def earth_words(drive: DriveTable, earth: EarthTable) -> str:
 
 
 def downloads(drive: DriveTable) -> str:
-    """The drive's files, in the page."""
+    """Returns links to the files of the drive, which the page contains."""
     out = []
     for name, text in drive.files.items():
         data = base64.b64encode(text.encode()).decode("ascii")
@@ -118,7 +117,7 @@ def downloads(drive: DriveTable) -> str:
 
 
 def details(drive: DriveTable) -> str:
-    """The camera, the networks and the versions."""
+    """Returns the camera, the networks and the versions."""
     versions, models = drive.summary.get("versions", {}), drive.summary.get("models", {})
     rows = {**(versions if isinstance(versions, dict) else {})}
     for role, model in (models if isinstance(models, dict) else {}).items():
