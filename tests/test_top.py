@@ -86,13 +86,13 @@ def test_the_table_says_how_every_node_is(vehicle: Path) -> None:
     assert "frame 123  epoch 3  NOT VALID" in text
     assert "25 ms of its budget left" in text
     assert "camera_dark" in text
-    assert "metres from road and car" in text
-    assert "the car's own speed: 4900 readings, 7 lost, 2 malformed" in text
+    assert "scale from road and car" in text
+    assert "vehicle speed: 4900 readings, 7 lost, 2 malformed" in text
     assert "stale" in row(text, "capture")
     perceive = row(text, "perceive")
     for cell in ("alive", "34.0", "1.5 / 2.5", "77", "41", "42"):
         assert cell in perceive.split() or cell in perceive, cell
-    assert "perceive was restarted 2 times, at last since it was killed by SIGKILL" in text
+    assert "perceive was restarted 2 times, the last time because it was killed by SIGKILL" in text
     assert "SILENT" in row(later, "optimize")
     assert "record" not in text  # nothing is recorded
 

@@ -1,1 +1,1 @@
-"""The command `birdslam`: modules here parse and print; what a command does lies with its subject."""
+"""The command `birdslam`: argument parsing and output. The logic of a command is in the package of its subject."""

@@ -1,7 +1,8 @@
-"""The table of the commands of `birdslam`, one row each; parser, help and dispatch read it.
+"""The table of the commands of `birdslam`, one row each, for parser, help and dispatch.
 
-A command is a module with a function that adds arguments to a parser and one that takes the parsed options and returns
-the exit status. It is imported only when it runs, so that `--help` is fast. This module is imported before numpy.
+A command is a module with a function that adds arguments to a parser and a function that takes the parsed options and
+returns the exit status. The module is imported only when it runs, so that `--help` is fast. This module must not import
+numpy.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Errors of the user: each is one line on standard error, and exit status 2."""
+"""User errors. Each is printed as one line on standard error, with exit status 2."""
 
 from birdslam.calibration.calibration import CalibrationError
 from birdslam.loops.gnss.earth import EarthError

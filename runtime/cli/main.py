@@ -1,4 +1,4 @@
-"""The command `birdslam`. An error of the user is one line on standard error and exit status 2, never a traceback."""
+"""The command `birdslam`. A user error is one line on standard error and exit status 2, without a traceback."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from birdslam.runtime.environment import CLOSED_PIPE_STATUS, ENVIRONMENT, INTERR
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Entry point; returns the exit status."""
+    """Runs a command and returns the exit status."""
     os.environ.update(ENVIRONMENT)  # numpy reads it on import
     options = parse(sys.argv[1:] if arguments is None else arguments)
     from birdslam.runtime.cli.errors import USER_ERRORS
@@ -22,7 +22,7 @@ def main(arguments: list[str] | None = None) -> int:
         return USER_ERROR_STATUS
     except KeyboardInterrupt:
         return INTERRUPTED_STATUS
-    except BrokenPipeError:  # `| head`; Python would complain again on its last flush
+    except BrokenPipeError:  # `| head`; avoids a second error at the last flush
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return CLOSED_PIPE_STATUS
 

@@ -1,4 +1,4 @@
-"""`birdslam map`: what a kept map holds, two of them as one, parts of one, pictures and other formats."""
+"""`birdslam map`: inspects, merges, trims, draws and exports maps."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ MAP = "FILE.map"
 
 
 def add_map_argument(parser: argparse.ArgumentParser) -> None:
-    """The map."""
+    """Adds the map."""
     parser.add_argument("map", type=Path, metavar=MAP)
 
 
 def info(options: argparse.Namespace) -> int:
-    """Prints what the map is."""
+    """Prints the contents of a map."""
     place_map = read_map(options.map)
     size = options.map.stat().st_size
     poses = place_map.poses()
@@ -31,21 +31,21 @@ def info(options: argparse.Namespace) -> int:
     rows = [
         ("keyframes", f"{len(place_map)} of {place_map.drives} drives"),
         ("points", str(sum(len(keyframe.points_m) for keyframe in place_map.keyframes))),
-        ("way", f"{place_map.length_m:.0f} m, {len(place_map.links) - loops} links and {loops} of loops"),
+        ("length", f"{place_map.length_m:.0f} m, {len(place_map.links) - loops} odometry links and {loops} loop links"),
         ("lines", str(len(place_map.lines()))),
-        ("size", f"{size / 1e6:.3f} MB, {size / 1e3 / max(place_map.length_m, 1.0):.2f} MB a km"),
+        ("size", f"{size / 1e6:.3f} MB, {size / 1e3 / max(place_map.length_m, 1.0):.2f} MB per km"),
         ("words", str(0 if place_map.words is None else len(place_map.words))),
         (
             "camera",
-            f"{camera.width_px}x{camera.height_px}, fx {camera.fx_px:g} px, {camera.height_m:g} m over the road",
+            f"{camera.width_px}x{camera.height_px}, fx {camera.fx_px:g} px, {camera.height_m:g} m above the road",
         ),
-        ("camera file", camera.digest),
+        ("camera digest", camera.digest),
         (
             "on Earth",
             "no"
             if earth is None
             else f"{earth.latitude_deg:.6f}, {earth.longitude_deg:.6f}; {earth.fixes - earth.outliers} keyframes have "
-            f"fixes, rms {earth.rms_m:.2f} m",
+            f"fixes, RMS {earth.rms_m:.2f} m",
         ),
     ]
     if len(poses):
@@ -56,34 +56,34 @@ def info(options: argparse.Namespace) -> int:
 
 
 def add_merge_arguments(parser: argparse.ArgumentParser) -> None:
-    """Two maps, and the one that they become."""
-    parser.add_argument("map", type=Path, metavar=MAP, help="its frame is that of the result")
+    """Adds two maps and the output."""
+    parser.add_argument("map", type=Path, metavar=MAP, help="map that defines the frame of the result")
     parser.add_argument("other", type=Path, metavar="OTHER.map")
     parser.add_argument("--output", type=Path, required=True, metavar=MAP)
 
 
 def merge(options: argparse.Namespace) -> int:
-    """One map of two that share streets."""
+    """Merges two maps that share streets."""
     out, found = merged(read_map(options.map), read_map(options.other))
     size = write_map(options.output, out)
     print(
-        f"{options.output}: {len(out)} keyframes, {size / 1e6:.2f} MB; {found} of {options.other} lie in {options.map}"
+        f"{options.output}: {len(out)} keyframes, {size / 1e6:.2f} MB; {found} of {options.other} are in {options.map}"
     )
     return 0
 
 
 def add_trim_arguments(parser: argparse.ArgumentParser) -> None:
-    """The map, what of it stays, and where to."""
+    """Adds the map, the part to keep and the output."""
     add_map_argument(parser)
     parser.add_argument("--output", type=Path, required=True, metavar=MAP)
     which = parser.add_mutually_exclusive_group(required=True)
-    text = "what lies within a radius of a point of the map, in metres"
+    text = "keep keyframes within a radius of a point, in metres"
     which.add_argument("--within", type=float, nargs=3, metavar=("X", "Y", "RADIUS"), help=text)
-    which.add_argument("--without-drive", type=int, metavar="N", help="all but what one drive brought")
+    which.add_argument("--without-drive", type=int, metavar="N", help="remove the keyframes of one drive")
 
 
 def trim(options: argparse.Namespace) -> int:
-    """A part of a map."""
+    """Writes a part of a map."""
     place_map = read_map(options.map)
     if options.within is not None:
         x_m, y_m, radius_m = options.within
@@ -98,20 +98,20 @@ def trim(options: argparse.Namespace) -> int:
 
     out = part(place_map, keeps)
     if not len(out):
-        raise ConfigurationError(f"{options.map}: nothing of its {len(place_map)} keyframes would stay")
+        raise ConfigurationError(f"{options.map}: the trimmed map would be empty ({len(place_map)} keyframes removed)")
     size = write_map(options.output, out)
     print(f"{options.output}: {len(out)} of {len(place_map)} keyframes, {size / 1e6:.2f} MB")
     return 0
 
 
 def add_picture_arguments(parser: argparse.ArgumentParser) -> None:
-    """The map and the picture."""
+    """Adds the map and the picture."""
     add_map_argument(parser)
     parser.add_argument("--output", type=Path, required=True, metavar="FILE.png")
 
 
 def picture(options: argparse.Namespace) -> int:
-    """The map from above."""
+    """Draws a map from above."""
     try:
         draw_map(read_map(options.map), options.output)
     except (OSError, ValueError) as error:
@@ -121,12 +121,18 @@ def picture(options: argparse.Namespace) -> int:
 
 
 def add_export_arguments(parser: argparse.ArgumentParser) -> None:
-    """The map and the file."""
+    """Adds the map and the output file."""
     add_map_argument(parser)
-    parser.add_argument("--output", type=Path, required=True, metavar="FILE", help=f"its suffix says how: {FORMATS}")
+    parser.add_argument(
+        "--output",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help=f"file to write: {FORMATS}",
+    )
 
 
 def export(options: argparse.Namespace) -> int:
-    """The map in the formats of others."""
+    """Exports a map to another format."""
     print(f"{options.output}: {export_map(read_map(options.map), options.output)}")
     return 0

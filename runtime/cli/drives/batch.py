@@ -1,4 +1,4 @@
-"""`birdslam batch`: many drives, one report. Exit status 1 where a drive failed, 130 after Ctrl-C."""
+"""`birdslam batch`: runs many drives and writes one report. Exit status 1 if a drive failed, 130 after Ctrl-C."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from birdslam.runtime.options import constants_of, overrides_of
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The drives, where they run, and the pipeline of each."""
-    text = "a source, a KITTI directory, a bag, a recording, a video; a directory with such; a text file of them"
+    """Adds the drives, the engine and the pipeline."""
+    text = "source, KITTI directory, bag, recording or video; a directory of these; a text file that lists them"
     parser.add_argument("drives", nargs="+", metavar="DRIVE", help=text)
-    parser.add_argument("--jobs", type=int, metavar="N", help="drives at once (as many as fit this computer)")
-    text = "ray: on a cluster (pip install birdslam[ray]); the output folder is on storage that all nodes share"
+    parser.add_argument("--jobs", type=int, metavar="N", help="parallel drives; default: as many as fit this computer")
+    text = "ray: on a cluster (pip install birdslam[ray]), with --output on storage that all nodes share"
     parser.add_argument("--engine", choices=("local", "ray"), default="local", help=text)
-    text = "of the Ray cluster (auto: the one of this computer)"
+    text = "address of the Ray cluster (auto: the cluster of this computer)"
     parser.add_argument("--address", default="auto", metavar="HOST:PORT", help=text)
-    text = "every drive with each of these settings; may be repeated: every combination"
+    text = "run every drive with each of these values; repeatable: every combination"
     parser.add_argument("--sweep", action="append", default=[], metavar="KEY=V1,V2", help=text)
-    text = "one map of places of all drives that share streets, made when all have ended; begun from what is there"
+    text = "merge the drives that share streets into one map, after the last drive; extends an existing map"
     parser.add_argument("--map", metavar="FILE", help=text)
     add_config(parser)
     add_topics(parser, "speed", "truth")
@@ -33,12 +33,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Runs the drives that are not done yet, and prints where the report is."""
+    """Runs the drives that are not done yet and prints the path of the report."""
     output = Path(options.output)
     overrides, models = overrides_of(options)
     overrides.pop("output", None)
     if options.jobs is not None and options.jobs < 1:
-        raise ConfigurationError(f"--jobs {options.jobs}: one or more")
+        raise ConfigurationError(f"--jobs {options.jobs}: expected 1 or more")
     constants = constants_of(options)
     todo = tasks(find_drives(options.drives), sweep(options.sweep), options.config, overrides, models, constants)
     if before := sum(done(output, task) for task in todo):
@@ -49,7 +49,7 @@ def run(options: argparse.Namespace) -> int:
         size = f"{outcome.map.keyframes} keyframes, {outcome.map.size / 1e6:.2f} MB"
         print(f"{map_file}: {size}, {len(outcome.map.inside)} drives")
         if outcome.map.outside:
-            print(f"not in it, for want of a street in common: {', '.join(outcome.map.outside)}")
+            print(f"not in the map, because they share no street with it: {', '.join(outcome.map.outside)}")
     ended = outcome.drives - outcome.failed - outcome.interrupted
     print(f"{ended} of {outcome.drives} drives: {output / 'report.html'}")
     return INTERRUPTED_STATUS if outcome.interrupted else int(outcome.failed > 0)

@@ -1,4 +1,4 @@
-"""`birdslam calibrate`: a camera file from a drive."""
+"""`birdslam calibrate`: writes a camera file from a drive."""
 
 from __future__ import annotations
 
@@ -17,31 +17,31 @@ from birdslam.sources.schemes import written
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The drive, and its camera where one is known."""
+    """Adds the drive and known parameters of the camera."""
     parser.add_argument("source", metavar="SOURCE", help=f"a KITTI directory, or {written(recorded_schemes())}")
     parser.add_argument("--output", required=True, metavar="CAMERA.toml", help="the camera file to write")
     lens = parser.add_mutually_exclusive_group()
-    lens.add_argument("--camera", metavar="FILE", help="an older camera file: its intrinsics and height")
+    lens.add_argument("--camera", metavar="FILE", help="older camera file, for intrinsics and height")
     lens.add_argument("--intrinsics", type=Path, metavar="FILE", help="calibration of another project")
     lens.add_argument("--chessboard", type=Path, metavar="DIR", help="images of a chessboard")
-    parser.add_argument("--board", default="9x6", metavar="COLSxROWS", help="its inner corners (default 9x6)")
-    parser.add_argument("--square-mm", type=float, default=25.0, metavar="MM", help="a square's side (default 25)")
-    parser.add_argument("--height", type=float, metavar="M", help="the camera's height over the road, as measured")
+    parser.add_argument("--board", default="9x6", metavar="COLSxROWS", help="inner corners of the board (default 9x6)")
+    parser.add_argument("--square-mm", type=float, default=25.0, metavar="MM", help="side of a square (default 25)")
+    parser.add_argument("--height", type=float, metavar="M", help="measured height of the camera above the road")
     add_lens(parser)
     text = "lines of time in s, speed in m/s"
     parser.add_argument("--speed", dest="known_speed", type=Path, metavar="FILE", help=text)
     add_topics(parser)
-    parser.add_argument("--model", action="append", default=[], metavar="ROLE=PATH", help="networks: vehicles and road")
-    parser.add_argument("--stride", type=int, metavar="N", help="every N-th frame")
+    parser.add_argument("--model", action="append", default=[], metavar="ROLE=PATH", help="networks (vehicles, road)")
+    parser.add_argument("--stride", type=int, metavar="N", help="read every N-th frame")
     add_config(parser)
     add_settings(parser)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Writes the camera file, prints what it rests on."""
+    """Writes the camera file and prints the evidence for each parameter."""
     board = re.fullmatch(r"(\d+)x(\d+)", options.board)
     if board is None:
-        raise ConfigurationError(f"--board {options.board}: expected COLSxROWS, as 9x6")
+        raise ConfigurationError(f"--board {options.board}: expected COLSxROWS, such as 9x6")
     given = Given(
         camera=None if options.camera is None else Path(options.camera),
         intrinsics=options.intrinsics,

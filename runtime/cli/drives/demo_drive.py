@@ -1,4 +1,4 @@
-"""`birdslam demo-drive make`: the shipped drive, rendered again."""
+"""`birdslam demo-drive make`: renders the shipped drive again."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ from birdslam.runtime.configuration import ConfigurationError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Adds folder, length and image quality."""
-    parser.add_argument("--output", type=Path, required=True, metavar="DIR", help="for drive.npz and camera.toml")
+    """Adds output, length and image quality."""
+    text = "directory of drive.npz and camera.toml"
+    parser.add_argument("--output", type=Path, required=True, metavar="DIR", help=text)
     parser.add_argument("--frames", type=int, metavar="N", help="end after N frames")
-    parser.add_argument("--quality", type=int, default=32, metavar="1-100", help="of its WebP images (32)")
+    parser.add_argument("--quality", type=int, default=32, metavar="1-100", help="quality of the WebP images (32)")
 
 
 def run(options: argparse.Namespace) -> int:

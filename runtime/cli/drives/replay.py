@@ -1,4 +1,4 @@
-"""`birdslam replay`: a recording through the back end again, to be compared or with other results."""
+"""`birdslam replay`: runs the back end on a recording, to compare its estimates or to write new results."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from birdslam.runtime.replay.results import changed_back_end, write_g2o, write_r
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The recording, and the results to make of it; without any, it is compared."""
+    """Adds the recording and the results. Without results, the estimates are compared."""
     parser.add_argument("recording", type=Path, metavar=RECORDING)
-    text = "with another back end (method, slam.graph.*, slam.weights.*): nothing is compared, results are written"
+    text = "change the back end (method, slam.graph.*, slam.weights.*) and write results instead of comparing"
     add_settings(parser, text)
-    parser.add_argument("--output", type=Path, metavar="DIR", help="where results go; with it they are always written")
+    parser.add_argument("--output", type=Path, metavar="DIR", help="write results to this directory")
     add_final_results(parser)
-    parser.add_argument("--g2o", type=Path, metavar="FILE.g2o", help="write the graph's edges for other solvers, alone")
+    parser.add_argument("--g2o", type=Path, metavar="FILE.g2o", help="only write the edges of the graph, in g2o format")
 
 
 def run(options: argparse.Namespace) -> int:
-    """0 where the back end gives the recorded estimates, 1 where not; or new results."""
+    """Returns 0 if the back end reproduces the recorded estimates, 1 if not; or writes new results."""
     with file_progress("replay", options.recording) as progress:
         recording = Recording(options.recording, progress.reach)
         if options.g2o or options.set or options.constant or options.output or options.smooth or options.video:

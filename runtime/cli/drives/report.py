@@ -1,4 +1,4 @@
-"""`birdslam report`: a drive to look at, in any browser."""
+"""`birdslam report`: writes an HTML page of a drive."""
 
 from __future__ import annotations
 
@@ -10,14 +10,16 @@ from birdslam.runtime.supervision.drive_report import write_report
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The results, and where the report goes."""
-    parser.add_argument("source", type=Path, metavar="DIR|FILE.mcap", help="of `birdslam run --output` or `--record`")
+    """Adds the results and the page."""
+    text = "results of `birdslam run --output` or recording of `--record`"
+    parser.add_argument("source", type=Path, metavar="DIR|FILE.mcap", help=text)
     parser.add_argument("-o", "--output", type=Path, metavar="FILE.html", help=f"default: {REPORT} beside the results")
-    parser.add_argument("--video", type=Path, metavar="FILE.mp4", help="of --video, where the results do not name it")
+    text = "video of `birdslam run --video`, if the results do not name it"
+    parser.add_argument("--video", type=Path, metavar="FILE.mp4", help=text)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Writes it, says where."""
+    """Writes the page and prints its path."""
     beside = options.source if options.source.is_dir() else options.source.parent
     path = options.output or beside / REPORT
     size = write_report(options.source, path, options.video)

@@ -1,4 +1,4 @@
-"""`birdslam view`: a recording, or what goes on now, in rerun."""
+"""`birdslam view`: shows a recording or a running vehicle in rerun."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from birdslam.runtime.recording.recording import Recording
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """What is shown, and where."""
+    """Adds the recording or the vehicle, and the viewer."""
     parser.add_argument("what", metavar=f"{RECORDING}|live")
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--save", type=Path, metavar="FILE.rrd", help="write a file for rerun instead of showing it")
-    text = "show it in a browser of this computer, and nobody else's, until Ctrl-C; default port: 9090"
+    text = "serve a page to browsers of this computer only, until Ctrl-C; default port: 9090"
     where.add_argument("--web", type=int, nargs="?", const=9090, metavar="PORT", help=text)
     add_vehicle(parser)
-    parser.add_argument("--seconds", type=float, metavar="S", help="of live: end after so long")
+    parser.add_argument("--seconds", type=float, metavar="S", help="end a live view after S seconds")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Shows it; 1 where nothing came from a vehicle."""
-    recording = None if options.what == "live" else Recording(Path(options.what))  # refused before a page is served
+    """Shows it; returns 1 if no message of a vehicle arrived."""
+    recording = None if options.what == "live" else Recording(Path(options.what))  # fails before a page is served
     if options.web is None:
         return _show(options, recording, options.save)
     from birdslam.runtime.recording.rerun_web import WebViewer  # rerun is an extra
@@ -31,7 +31,7 @@ def run(options: argparse.Namespace) -> int:
         print(f"open {viewer.page}", flush=True)
         status = _show(options, recording, viewer.data)
         if options.seconds is None and not status:
-            print("it is over; Ctrl-C ends the viewer too", flush=True)
+            print("the drive is over; Ctrl-C ends the viewer", flush=True)
             viewer.wait()
     return status
 

@@ -1,1 +1,1 @@
-"""Commands that compare with ground truth: `birdslam evaluate WHAT`."""
+"""Commands that compare estimates with ground truth: `birdslam evaluate WHAT`."""

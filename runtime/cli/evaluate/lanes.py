@@ -1,4 +1,4 @@
-"""`birdslam evaluate lanes`: a picture of what one frame's lanes are made of, or lanes against truth."""
+"""`birdslam evaluate lanes`: draws the lanes of a frame, or compares lanes with ground truth."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ KITTI_ROAD, LINES, PAINT, LATER = "kitti-road", "lines", "paint", "later"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The drive, the frame or the kind of truth, and the pipeline."""
-    parser.add_argument("drive", metavar="DRIVE|DIR", help="a KITTI directory, or a source's URI; images with --truth")
-    parser.add_argument("--frame", type=int, metavar="N", help="which one; default: the last")
-    text = "kitti-road: DIR holds single images image_N.png with masks ego_lane_N.png of the ego's lane; "
-    text += "lines: DRIVE is a rendered one, demo:DIR, with its true lines; "
-    text += "paint: DIR holds imgs/NAME.png and masks/NAME.png of lane markings, as comma10k has them; "
-    text += "later: what later frames of DRIVE show of the road behind vehicles"
+    """Adds the drive, the frame or the kind of truth, and the pipeline."""
+    text = "KITTI directory or URI of a source; directory of images with --truth"
+    parser.add_argument("drive", metavar="DRIVE|DIR", help=text)
+    parser.add_argument("--frame", type=int, metavar="N", help="frame to draw; default: the last")
+    text = "kitti-road: DIR has single images image_N.png with masks ego_lane_N.png of the ego lane; "
+    text += "lines: DRIVE is a rendered drive with true lines, demo:DIR; "
+    text += "paint: DIR has imgs/NAME.png and masks/NAME.png of lane markings, as in comma10k; "
+    text += "later: compares the completed road behind vehicles with later frames of DRIVE"
     parser.add_argument("--truth", choices=(KITTI_ROAD, LINES, PAINT, LATER), help=text)
-    parser.add_argument(
-        "--height", type=float, metavar="M", help="of the camera over the road, with --truth kitti-road"
-    )
+    text = "camera height above the road, with --truth kitti-road"
+    parser.add_argument("--height", type=float, metavar="M", help=text)
     add_config(parser)
     add_pipeline(parser)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Draws it and names the file; with truth prints the scores."""
+    """Draws the lanes and prints the file name, or prints the scores against the truth."""
     configuration = configuration_of(options)
     if options.truth == LINES:
         print(_text(evaluate_drive(configuration, options.drive)))
@@ -52,33 +52,33 @@ def run(options: argparse.Namespace) -> int:
     for found in report.by_image:
         width = "no lane" if found.width_m is None else f"{found.width_m:.2f} m between {found.left} and {found.right}"
         print(f"{found.image:16} IoU {found.ego_lane_iou:.3f}, in the image {found.ego_lane_iou_image:.3f}: {width}")
-    print(f"{report.images} images: mean IoU of the ego's lane {report.ego_lane_iou_mean:.3f}")
+    print(f"{report.images} images: mean IoU of the ego lane {report.ego_lane_iou_mean:.3f}")
     print(Path(configuration.output) / REPORT)
     return 0
 
 
 def _paint_text(report: PaintReport) -> str:
-    def said(value: float | None) -> str:
+    def formatted(value: float | None) -> str:
         return "    -" if value is None else f"{value:5.2f}"
 
     out = [
-        f"{found.image[:24]:24} {'night' if found.night else '':5} precision {said(found.precision)} "
-        f"recall {said(found.recall)}, {found.true_px} px of paint"
+        f"{found.image[:24]:24} {'night' if found.night else '':5} precision {formatted(found.precision)} "
+        f"recall {formatted(found.recall)}, {found.true_px} true px"
         for found in report.by_image
     ]
     out.append(
-        f"{report.network}: {report.images} images, at 5 px: precision {said(report.precision)}, "
-        f"recall {said(report.recall)}, by night {said(report.recall_by_night)}"
+        f"{report.network}: {report.images} images, at 5 px: precision {formatted(report.precision)}, "
+        f"recall {formatted(report.recall)}, at night {formatted(report.recall_by_night)}"
     )
     return "\n".join(out)
 
 
 def _hidden_text(report: HiddenReport) -> str:
-    out = [f"{report.drive}: {report.cells} cells behind vehicles in {report.frames} frames that later frames saw"]
+    out = [f"{report.drive}: {report.cells} cells behind vehicles in {report.frames} frames, observed by later frames"]
     for name in METHODS:
         road, line = report.road_iou[name], report.line_iou[name]
-        said = (f"{what} {'-' if iou is None else f'{iou:.3f}'}" for what, iou in (("road", road), ("lines", line)))
-        out.append(f"  {name:8} IoU of {', of '.join(said)}")
+        ious = (f"{kind} {'-' if iou is None else f'{iou:.3f}'}" for kind, iou in (("road", road), ("lines", line)))
+        out.append(f"  {name:8} IoU of {', of '.join(ious)}")
     return "\n".join(out)
 
 
@@ -91,19 +91,19 @@ def _text(report: DriveReport) -> str:
         for at in lines.ranges
         if at.error_median_m is not None
     ]
-    said = {
-        "heading": (lines.heading_error_median_deg, "{:.2f} deg"),
-        "width": (lines.width_error_rel, "{:+.1%}"),
-        "lines found": (lines.recall, "{:.0%}"),
-        "false lines a km": (lines.false_lines_per_km, "{:.1f}"),
+    values = {
+        "heading error": (lines.heading_error_median_deg, "{:.2f} deg"),
+        "width error": (lines.width_error_rel, "{:+.1%}"),
+        "recall of lines": (lines.recall, "{:.0%}"),
+        "false lines per km": (lines.false_lines_per_km, "{:.1f}"),
         "frames with an ego lane": (lines.ego_lane_share, "{:.1%}"),
-        "wrong": (lines.ego_lane_wrong, "{:.1%}"),
+        "wrong ego lane": (lines.ego_lane_wrong, "{:.1%}"),
         "jitter": (lines.jitter_m, "{:.3f} m"),
-        "right after": (lines.found_after_s, "{:.2f} s"),
-        "vehicles in their lane": (vehicles.right, "{:.1%} of " + str(vehicles.vehicles)),
+        "time to detection": (lines.found_after_s, "{:.2f} s"),
+        "vehicles in the true lane": (vehicles.right, "{:.1%} of " + str(vehicles.vehicles)),
         "log loss": (vehicles.log_loss, "{:.3f}"),
-        "leader named": (vehicles.leader_right, "{:.1%} of " + str(vehicles.leaders)),
-        "gap's error": (vehicles.gap_error_median_m, "{:.2f} m median"),
+        "true leader": (vehicles.leader_right, "{:.1%} of " + str(vehicles.leaders)),
+        "gap error": (vehicles.gap_error_median_m, "{:.2f} m median"),
     }
-    out += [f"  {name}: {form.format(value)}" for name, (value, form) in said.items() if value is not None]
+    out += [f"  {name}: {form.format(value)}" for name, (value, form) in values.items() if value is not None]
     return "\n".join(out)

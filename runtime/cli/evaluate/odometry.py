@@ -1,4 +1,4 @@
-"""`birdslam evaluate odometry` and `evaluate car-ahead`: the whole method in one process, against poses and LiDAR."""
+"""`birdslam evaluate odometry` and `evaluate car-ahead`: compare the method with true poses and with LiDAR."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from birdslam.runtime.supervision.run import WITHOUT_MODELS
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Sequences, the frames that count, and the pipeline."""
-    parser.add_argument("sequences", nargs="+", metavar="SEQUENCE_DIR", help="a KITTI directory, or a source's URI")
+    """Adds sequences, the compared frames and the pipeline."""
+    parser.add_argument("sequences", nargs="+", metavar="SEQUENCE_DIR", help="KITTI directory or URI of a source")
     add_config(parser)
-    parser.add_argument("--frames", default=":", metavar="FIRST:END", help="compare these alone; all are driven")
+    text = "frames that are compared; all frames are processed"
+    parser.add_argument("--frames", default=":", metavar="FIRST:END", help=text)
     add_speeds(parser)
     add_other_odometry(parser, "FILE|DIR")
     add_topics(parser, "speed", "truth")
@@ -26,22 +27,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Trajectories against the truth: a table."""
+    """Prints a table of trajectory errors."""
     print(_table(_evaluate(options)))
     return 0
 
 
 def run_car_ahead(options: argparse.Namespace) -> int:
-    """The distance to the car ahead against the recording's LiDAR: a line for each sequence."""
+    """Prints the error of the distance to the car ahead from LiDAR, a line per sequence."""
     for report in _evaluate(options):
         ahead = report.car_ahead
         if ahead is None:
-            raise ConfigurationError(f"{report.sequence}: has no LiDAR (lidar_cam0 beside its images) to compare with")
+            raise ConfigurationError(f"{report.sequence}: has no LiDAR; expected lidar_cam0 beside its images")
         if ahead.error_median_rel is None or ahead.error_p90_rel is None or ahead.bias_median_rel is None:
             print(f"{report.sequence}: no car ahead in {report.frames} frames")
         else:
             print(
-                f"{report.sequence}: {ahead.frames} frames with a car ahead, error of its distance: "
+                f"{report.sequence}: {ahead.frames} frames with a car ahead, distance error: "
                 f"median {ahead.error_median_rel:.1%}, 90 % within {ahead.error_p90_rel:.1%}, "
                 f"bias {ahead.bias_median_rel:+.1%}"
             )
@@ -59,7 +60,7 @@ def _evaluate(options: argparse.Namespace) -> list[OdometryReport]:
 
 
 def _frames(text: str) -> slice:
-    """FIRST:END, of which either may be missing."""
+    """Parses FIRST:END; either may be missing."""
     first, colon, end = text.partition(":")
     if not colon or not all(part.isdecimal() for part in (first, end) if part):
         raise ConfigurationError(f"--frames {text}: expected FIRST:END, such as 14: or 14:120")
@@ -78,14 +79,14 @@ def _table(reports: Sequence[OdometryReport]) -> str:
         ("RPE m", "rpe_t_m", 4),
         ("RPE deg", "rpe_r_deg", 4),
         ("segments %", "segment_t_pct", 2),
-        ("standing m", "standing_drift_m", 3),
+        ("still m", "standing_drift_m", 3),
         ("NEES", "ego.nees", 2),
         ("inside 95 %", "ego.inside_95", 2),
         ("motion NEES", "motion.frames.nees", 2),
-        ("its median", "motion.frames.nees_median", 2),
+        ("median", "motion.frames.nees_median", 2),
         ("measured", "motion.frames.nees_measured", 2),
         ("10 m NEES", "motion.stretches.nees", 2),
-        ("its median", "motion.stretches.nees_median", 2),
+        ("median", "motion.stretches.nees_median", 2),
         ("measured", "motion.stretches.nees_measured", 2),
     )
     lines = [f"{'sequence':16}" + "".join(f"{title:>12}" for title, _, _ in columns)]
@@ -97,7 +98,7 @@ def _table(reports: Sequence[OdometryReport]) -> str:
 
 
 def _field(report: Any, name: str) -> float | None:
-    """A field of a report, or of a report in it: `ego.nees`; None where that is not there."""
+    """Returns a field or a nested field of a report, as in `ego.nees`; None if it is missing."""
     for part in name.split("."):
         report = None if report is None else getattr(report, part)
     return cast("float | None", report)

@@ -1,4 +1,4 @@
-"""`birdslam evaluate tracking` and `evaluate ablation`: the paper's tables on KITTI tracking."""
+"""`birdslam evaluate tracking` and `evaluate ablation`: the tables of the paper on KITTI tracking."""
 
 from __future__ import annotations
 
@@ -20,38 +20,40 @@ SEEDS = 5
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Sequences, methods, odometry and boxes."""
-    text = "how good the tracks of each class are, in metres and in the image, in place of the paper's tables"
+    """Adds sequences, methods, odometry and boxes."""
+    text = "print tracking metrics of each class, in metres and in the image, instead of the tables of the paper"
     parser.add_argument("--classes", action="store_true", help=text)
     parser.add_argument("--methods", default=",".join(METHODS), metavar="NAME,NAME", help=", ".join(METHODS))
     add_ablation_arguments(parser)
 
 
 def add_ablation_arguments(parser: argparse.ArgumentParser) -> None:
-    """The same without methods: those are of Tables 1 and 2."""
+    """Adds the same arguments except the methods of Tables 1 and 2."""
     add_tracking_root(parser)
-    parser.add_argument("--frames", default="all", metavar="all|paper|A:B", help="paper: its first so many frames")
+    parser.add_argument("--frames", default="all", metavar="all|paper|A:B", help="paper: as many frames as the paper")
     parser.add_argument(
         "--odometry", default="", metavar="images|simulate|truth|FILE", help="FILE: KITTI rows of camera 0"
     )
-    parser.add_argument("--detections", default="", metavar="rrc|network|DIR", help="DIR: as det_02_rrc")
+    text = "boxes; DIR: files as in det_02_rrc"
+    parser.add_argument("--detections", default="", metavar="rrc|network|DIR", help=text)
     add_speeds(parser)
-    parser.add_argument("--seeds", type=int, default=SEEDS, metavar="N", help="of the simulated odometry")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="processes")
+    parser.add_argument("--seeds", type=int, default=SEEDS, metavar="N", help="seeds of the simulated odometry")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="number of processes")
     add_config(parser)
-    parser.add_argument("--model", action="append", default=[], metavar="ROLE=PATH", help="for network, images")
+    text = "networks for --detections network and --odometry images"
+    parser.add_argument("--model", action="append", default=[], metavar="ROLE=PATH", help=text)
     add_settings(parser)
-    parser.add_argument("--output", required=True, metavar="DIR", help="where the report goes")
+    parser.add_argument("--output", required=True, metavar="DIR", help="directory of the report")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Both commands: writes the report and prints it."""
+    """Writes and prints the report of either command."""
     configuration = configuration_of(options)
     return _classes(options, configuration) if getattr(options, "classes", False) else evaluate(options, configuration)
 
 
 def _classes(options: argparse.Namespace, configuration: Configuration) -> int:
-    """The tracks of each class by recorded boxes, known ego motion and the images' error of the tilt."""
+    """Evaluates tracks by class, with recorded boxes, true ego motion and the tilt error of visual odometry."""
     output = Path(options.output)
     names = sequences_of(options.root, options.sequences)
     claim_directory(output)
@@ -63,7 +65,7 @@ def _classes(options: argparse.Namespace, configuration: Configuration) -> int:
 
 
 def evaluate(options: argparse.Namespace, configuration: Configuration) -> int:
-    """With a configuration that is there already."""
+    """Writes and prints the tables of the paper."""
     if options.seeds < 1:
         raise ConfigurationError(f"--seeds {options.seeds}: needs 1 or more")
     output = Path(options.output)
@@ -85,9 +87,10 @@ def evaluate(options: argparse.Namespace, configuration: Configuration) -> int:
 
 
 def _print_done(outcome: Outcome, number: int, of: int, to_go: str) -> None:
+    remaining = f", {to_go} remaining" if to_go else ""
     print(
         f"sequence {outcome.sequence}: {len(outcome.frames)} frames, odometry: {outcome.odometry}, done "
-        f"({number} of {of}{f', {to_go} to go' if to_go else ''})",
+        f"({number} of {of}{remaining})",
         file=sys.stderr,
         flush=True,
     )

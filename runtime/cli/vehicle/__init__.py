@@ -1,1 +1,1 @@
-"""Commands on a vehicle's computer, and over many vehicles."""
+"""Commands on the computer of a vehicle and for a fleet."""

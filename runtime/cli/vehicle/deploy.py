@@ -1,4 +1,4 @@
-"""`birdslam deploy`: a folder that installs the service."""
+"""`birdslam deploy`: writes a directory that installs the service."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from birdslam.runtime.deployment import write_deployment
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The folder."""
+    """Adds the directory."""
     parser.add_argument("directory", type=Path, metavar="DIR", help="a new directory")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Writes the folder and names the script to run."""
+    """Writes the directory and prints the script to run."""
     deploy = write_deployment(options.directory)
-    print(f"as root: {deploy / 'install.sh'}; {deploy / 'README.md'} says more")
+    print(f"run as root: {deploy / 'install.sh'}; see {deploy / 'README.md'}")
     return 0

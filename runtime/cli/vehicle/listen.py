@@ -1,4 +1,4 @@
-"""`birdslam listen`: live estimates in a terminal, of one vehicle as its planner gets them, or of a whole fleet."""
+"""`birdslam listen`: prints live estimates of one vehicle, as its planner receives them, or of a fleet."""
 
 from __future__ import annotations
 
@@ -17,35 +17,35 @@ from birdslam.runtime.fleet.listener import Fleet
 from birdslam.runtime.supervision.run import check_runtime_dir
 from birdslam.types import Estimate, Lanes, Status
 
-MAX_AGE_MS = 1000.0  # of a fleet's estimate that counts as on time
+MAX_AGE_MS = 1000.0  # of an estimate of a fleet that is on time
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """One vehicle, or all of a fleet, and how long."""
+    """Adds the vehicle or the fleet, and limits."""
     add_vehicle(parser)
     add_fleet(parser)
-    parser.add_argument("--json", action="store_true", help="one JSON object a line")
+    parser.add_argument("--json", action="store_true", help="one JSON object per line")
     parser.add_argument("--count", metavar="N", type=int, help="end after N estimates")
-    parser.add_argument("--timeout", metavar="S", type=float, help="end, with status 1, when none comes for so long")
+    parser.add_argument("--timeout", metavar="S", type=float, help="end with status 1 after S seconds without estimate")
 
 
 def run(options: argparse.Namespace) -> int:
-    """A line for each estimate; 1 where none came within the time-out."""
+    """Prints a line per estimate; returns 1 after a timeout."""
     if options.all is None:
-        whose, lines = f"vehicle {options.vehicle!r}", _of_vehicle(options)
+        subject, lines = f"vehicle {options.vehicle!r}", _of_vehicle(options)
     else:
-        whose, lines = "any vehicle", _of_fleet(options)
+        subject, lines = "any vehicle", _of_fleet(options)
     with closing(lines):
         for line in islice(lines, options.count):
             if line is None:
-                print(f"birdslam: no estimate of {whose} in {options.timeout:g} s", file=sys.stderr)
+                print(f"birdslam: no estimate of {subject} in {options.timeout:g} s", file=sys.stderr)
                 return 1
             print(line, flush=True)
     return 0
 
 
 def _of_vehicle(options: argparse.Namespace) -> Generator[str | None]:
-    """Until the source ends; None: the time is out."""
+    """Yields lines until the source ends; None after a timeout."""
     check_runtime_dir(options.vehicle, options.runtime_dir)
     with Planner(options.vehicle, options.runtime_dir) as planner:
         while (estimate := planner.wait(options.timeout)) is not None:
@@ -67,7 +67,7 @@ def _of_fleet(options: argparse.Namespace) -> Generator[str | None]:
     with Fleet(load(options.all).fleet) as fleet:
         while (reading := fleet.wait(options.timeout, MAX_AGE_MS)) is not None:
             estimate = reading.estimate
-            if estimate is None:  # it was malformed: the log has it
+            if estimate is None:  # malformed; it is in the log
                 continue
             if options.json:
                 yield msgspec.json.encode({"vehicle": reading.vehicle, "estimate": estimate}).decode()
@@ -78,15 +78,15 @@ def _of_fleet(options: argparse.Namespace) -> Generator[str | None]:
 
 
 def _lane(lanes: Lanes | None) -> str:
-    """The ego's lane and who is ahead in it."""
+    """Returns the ego lane and its leader."""
     if lanes is None or lanes.ego is None:
         return ""
     own = lanes.ego
-    said = f"lane {lanes.ego_index + 1 if lanes.ego_index is not None else 0} of {len(lanes.lanes)} from the left, "
-    said += f"{own.width_m:.1f} m wide, its middle {own.offset_m:+.2f} m"
+    text = f"lane {lanes.ego_index + 1 if lanes.ego_index is not None else 0} of {len(lanes.lanes)} from the left, "
+    text += f"{own.width_m:.1f} m wide, centre at {own.offset_m:+.2f} m"
     if lanes.leader is not None:
-        said += f", {lanes.leader.vehicle} ahead at {lanes.leader.gap_m:.0f} m"
-    return said + "  "
+        text += f", {lanes.leader.vehicle} ahead at {lanes.leader.gap_m:.0f} m"
+    return text + "  "
 
 
 def _ego(estimate: Estimate, age_ms: float, valid: bool) -> str:

@@ -1,4 +1,4 @@
-"""`birdslam ros`: a vehicle's estimates for ROS 2, beside its run."""
+"""`birdslam ros`: publishes the estimates of a running vehicle in ROS 2."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from birdslam.runtime.supervision.run import check_runtime_dir
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Which vehicle, and which part of ROS."""
-    parser.add_argument("config", nargs="?", type=Path, metavar="CONFIG.toml", help="of the vehicle")
-    parser.add_argument("--vehicle", metavar="NAME", help="its name on the bus")
-    parser.add_argument("--runtime-dir", metavar="DIR", help="as runtime.runtime_dir of the run")
+    """Adds the vehicle and the ROS connection."""
+    parser.add_argument("config", nargs="?", type=Path, metavar="CONFIG.toml", help="configuration of the vehicle")
+    parser.add_argument("--vehicle", metavar="NAME", help="name of the vehicle on the bus")
+    parser.add_argument("--runtime-dir", metavar="DIR", help="runtime.runtime_dir of the run")
     add_ros(parser)
-    parser.add_argument("--rate", dest="rate_hz", type=float, metavar="HZ", help="at most so many estimates a second")
+    parser.add_argument("--rate", dest="rate_hz", type=float, metavar="HZ", help="maximum rate of estimates")
     add_settings(parser)
     parser.set_defaults(model=[])
 
 
 def add_ros(parser: argparse.ArgumentParser) -> None:
-    """Where ROS is."""
-    parser.add_argument("--router", metavar="tcp/HOST:PORT", help="of rmw_zenoh; default: tcp/localhost:7447")
-    parser.add_argument("--domain", type=int, metavar="N", help="default: ROS_DOMAIN_ID, else 0")
-    parser.add_argument("--namespace", metavar="/NAME", help="before our topics and frames")
+    """Adds router, domain and namespace of ROS."""
+    parser.add_argument("--router", metavar="tcp/HOST:PORT", help="router of rmw_zenoh; default: tcp/localhost:7447")
+    parser.add_argument("--domain", type=int, metavar="N", help="ROS domain; default: ROS_DOMAIN_ID, else 0")
+    parser.add_argument("--namespace", metavar="/NAME", help="namespace of topics and frames")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Until it is asked to end."""
+    """Publishes until a signal ends it."""
     if options.rate_hz is not None and not options.rate_hz > 0.0:
         raise ConfigurationError(f"--rate {options.rate_hz:g}: needs a positive number")
     configuration = configuration_of(options)

@@ -1,4 +1,4 @@
-"""`birdslam run`: runs the three processes on a source; a first pass calibrates a film that has no camera file."""
+"""`birdslam run`: runs the three processes on a source. A first pass calibrates a film without a camera file."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""`birdslam top`: the nodes of a running vehicle as a table, or all vehicles of a fleet, once a second.
+"""`birdslam top`: prints a table of the nodes of a running vehicle, or of the vehicles of a fleet, once a second.
 
-On a terminal it is refreshed in place; elsewhere (a pipe, a dumb terminal) a table follows the other.
+A terminal is refreshed in place; a pipe or a dumb terminal receives one table after the other.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from birdslam.runtime.wire import Health
 from birdslam.types import Estimate
 
 PERIOD_S = 1.0
-STALE_PERIODS = 3.0  # a health as old as that says nothing of now
-FLEET_MAX_AGE_MS = 1000.0  # of an estimate that counts as on time: what a watching person needs
+MAX_HEALTH_PERIODS = 3.0  # an older health record is stale
+FLEET_MAX_AGE_MS = 1000.0  # of an estimate that is on time
 CLEAR = "\x1b[H\x1b[2J"
 COLUMNS = (
     *(("node", 10), ("state", 9), ("mode", 9), ("Hz", 6)),
@@ -39,21 +39,21 @@ FLEET_COLUMNS = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """One vehicle, or all of a fleet."""
+    """Adds the vehicle or the fleet."""
     add_vehicle(parser)
     add_fleet(parser)
-    parser.add_argument("--once", action="store_true", help="one table, and end; 1 where no node is there")
+    parser.add_argument("--once", action="store_true", help="print one table and end; status 1 if no node is alive")
 
 
 def run(options: argparse.Namespace) -> int:
-    """The table of a vehicle's nodes, or of a fleet's vehicles."""
+    """Prints the nodes of a vehicle or the vehicles of a fleet."""
     if options.all is None:
         return top(options.vehicle, options.runtime_dir, options.once)
     return top_all(options.all, options.once)
 
 
 class VehicleTable:
-    """The nodes of a vehicle, by their health records, and its newest estimate."""
+    """The health of the nodes of a vehicle and its newest estimate."""
 
     def __init__(self, bus: Bus) -> None:
         self._bus = bus
@@ -62,7 +62,7 @@ class VehicleTable:
         self._budgets: BudgetsConfig | None = None
 
     def wait(self, timeout_s: float) -> None:
-        """Until each node has said what it said last, or for so long."""
+        """Waits for the last health record of each node, up to the timeout."""
         until_s = time.monotonic() + timeout_s
         self._bus.wait_alive(NODES, timeout_s)
         self._bus.catch_up("estimate", self._estimates)
@@ -73,22 +73,22 @@ class VehicleTable:
                 self._healths[name].recv(max(0.0, until_s - time.monotonic()))
 
     def pause(self, timeout_s: float) -> None:
-        """Until the optimizer, the last of the nodes, says something again, or for so long."""
+        """Waits for the next health record of the optimizer, the last node, up to the timeout."""
         self._healths["optimize"].recv(timeout_s)
 
     @property
-    def anybody(self) -> bool:
-        """Whether a node of this vehicle is there."""
+    def has_nodes(self) -> bool:
+        """Whether a node of this vehicle is alive."""
         return bool(self._bus.alive & set(PROCESSES))
 
     def table(self, now_ns: int) -> str:
-        """Everything, as lines."""
+        """Returns the table as text."""
         if self._budgets is None:
             self._budgets = _budgets(self._bus)
         head = _line_of([title for title, _ in COLUMNS], COLUMNS)
         rows = [self._row(name, now_ns) for name in PROCESSES if name in NODES or self._healths[name].newest]
         causes = [
-            f"{name} was restarted {health.restarts} times, at last since it {health.cause}"
+            f"{name} was restarted {health.restarts} times, the last time because it {health.cause}"
             for name in PROCESSES
             if (health := self._health(name)) is not None and health.restarts
         ]
@@ -102,7 +102,7 @@ class VehicleTable:
         alive, health = name in self._bus.alive, self._health(name)
         if health is None:
             return _line_of((name, _state(alive, stale=True)), COLUMNS)
-        stale = now_ns - health.t_ns > STALE_PERIODS * PERIOD_S * 1e9
+        stale = now_ns - health.t_ns > MAX_HEALTH_PERIODS * PERIOD_S * 1e9
         budget = "" if self._budgets is None or name not in NODES else f"{self._budgets.step_ms(name):g}"
         cells = (
             *(name, _state(alive, stale, health), health.mode, f"{health.rate_hz:.1f}"),
@@ -114,15 +114,15 @@ class VehicleTable:
         return _line_of(cells, COLUMNS)
 
     def _car(self) -> list[str]:
-        """What the car has said of its speed, where it says anything."""
+        """Returns the counters of the vehicle speed, if there are readings."""
         capture = self._health("capture")
         if capture is None or not (capture.speeds or capture.malformed):
             return []
         lost = f"{capture.speeds_dropped} lost, {capture.malformed} malformed"
-        return [f"the car's own speed: {capture.speeds} readings, {lost}"]
+        return [f"vehicle speed: {capture.speeds} readings, {lost}"]
 
     def _line(self, now_ns: int) -> str:
-        """The newest estimate."""
+        """Returns the summary of the newest estimate."""
         message: Message | None = self._estimates.newest
         if message is None:
             return f"{self._bus.vehicle}: no estimate"
@@ -134,7 +134,7 @@ class VehicleTable:
             f"{self._bus.vehicle}: frame {estimate.frame_id}  epoch {estimate.epoch}  "
             f"{'valid' if estimate.valid else 'NOT VALID'}  {age_ms:.0f} ms old{left}  "
             f"tracks {len(estimate.vehicles)}  people {len(estimate.people)}  "
-            f"metres from {' and '.join(estimate.speed_sources) or 'nothing yet'}  "
+            f"scale from {' and '.join(estimate.speed_sources) or 'nothing yet'}  "
             f"{' '.join(estimate.status)}"
         ).rstrip()
 
@@ -156,7 +156,7 @@ def _line_of(cells: Sequence[str], columns: Sequence[tuple[str, int]]) -> str:
 
 
 def _budgets(bus: Bus) -> BudgetsConfig | None:
-    """Of the run, where the supervisor answers."""
+    """Returns the budgets of the run, or None without a reply of the supervisor."""
     try:
         for configuration in bus.query("configuration", PERIOD_S):
             budgets: Any = configuration["budgets"] if isinstance(configuration, dict) else configuration.budgets
@@ -167,7 +167,7 @@ def _budgets(bus: Bus) -> BudgetsConfig | None:
 
 
 class FleetTable:
-    """The table of all vehicles, with rates since the table before."""
+    """The table of all vehicles, with rates since the previous table."""
 
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
@@ -175,26 +175,26 @@ class FleetTable:
         self._before_s = time.monotonic()
 
     def table(self) -> str:
-        """Everything, as lines."""
+        """Returns the table as text."""
         now_s = time.monotonic()
-        took_s, self._before_s = max(now_s - self._before_s, 1e-3), now_s
+        interval_s, self._before_s = max(now_s - self._before_s, 1e-3), now_s
         readings = self._fleet.readings(FLEET_MAX_AGE_MS)
-        rows = [self._row(reading, took_s) for reading in readings]
+        rows = [self._row(reading, interval_s) for reading in readings]
         alive, usable = sum(r.alive for r in readings), sum(r.usable for r in readings)
         router = "" if self._fleet.connected else "  THE ROUTER IS GONE"
         head = f"{len(readings)} vehicles: {alive} alive, {usable} alive, on time and valid{router}"
         return "\n".join([head, _line_of([title for title, _ in FLEET_COLUMNS], FLEET_COLUMNS), *rows])
 
-    def _row(self, reading: FleetReading, took_s: float) -> str:
+    def _row(self, reading: FleetReading, interval_s: float) -> str:
         received, estimate = self._fleet.received(reading.vehicle), reading.estimate
         before = self._before.get(reading.vehicle, Received(0, 0, 0, 0))
         self._before[reading.vehicle] = received
         ago = f"{reading.silent_ms / 1e3:.1f}" if estimate else ""
         cells: tuple[str, ...] = (
             *(reading.vehicle, _fleet_state(reading), "" if estimate is None else "yes" if reading.valid else "NO"),
-            f"{(received.estimates - before.estimates) / took_s:.1f}",
+            f"{(received.estimates - before.estimates) / interval_s:.1f}",
             *(f"{reading.age_ms:.0f}" if estimate else "", ago),
-            *(str(reading.lost), f"{(received.received_bytes - before.received_bytes) / took_s / 1e3:.1f}"),
+            *(str(reading.lost), f"{(received.received_bytes - before.received_bytes) / interval_s / 1e3:.1f}"),
         )
         if estimate is not None:
             cells += (str(estimate.frame_id), str(estimate.epoch), str(len(estimate.vehicles)))
@@ -209,7 +209,7 @@ def _fleet_state(reading: FleetReading) -> str:
 
 
 def refresh(table: Callable[[], str], pause: Callable[[], object], once: bool, out: TextIO) -> None:
-    """Writes the table again after each pause, until Ctrl-C; with `once` a single time."""
+    """Writes the table repeatedly until Ctrl-C, or once."""
     in_place = out.isatty() and os.environ.get("TERM", "dumb") != "dumb" and not once
     while True:
         text = table()
@@ -221,18 +221,18 @@ def refresh(table: Callable[[], str], pause: Callable[[], object], once: bool, o
 
 
 def top(vehicle: str, runtime_dir: Path | None, once: bool, out: TextIO = sys.stdout) -> int:
-    """A table of a vehicle's nodes once a second; with `once` a single one, and 1 where there is no node."""
+    """Prints the nodes of a vehicle every second, or once; returns 1 if no node is alive."""
     with Bus(vehicle, f"top-{os.getpid()}", runtime_dir=runtime_dir) as bus:
         nodes = VehicleTable(bus)
         nodes.wait(PERIOD_S)
         refresh(lambda: nodes.table(time.monotonic_ns()), lambda: nodes.pause(PERIOD_S), once, out)
-        return int(not nodes.anybody)
+        return int(not nodes.has_nodes)
 
 
 def top_all(config: Path, once: bool, out: TextIO = sys.stdout) -> int:
-    """A table of all vehicles once a second; with `once` a single one, and 1 where none is alive."""
+    """Prints all vehicles every second, or once; returns 1 if no vehicle is alive."""
     with Fleet(load(config).fleet) as fleet:
         vehicles = FleetTable(fleet)
-        time.sleep(PERIOD_S)  # rates are of this second
+        time.sleep(PERIOD_S)  # the interval of the first rates
         refresh(vehicles.table, lambda: time.sleep(PERIOD_S), once, out)
         return int(not any(reading.alive for reading in fleet.readings()))
