@@ -1,1 +1,1 @@
-"""`birdslam evaluate`: the jobs that run the method over recordings and hold it to their truth."""
+"""`birdslam evaluate`: runs the method on recordings and compares it with ground truth."""

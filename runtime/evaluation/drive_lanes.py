@@ -1,4 +1,4 @@
-"""Lanes over a rendered drive against its true lines."""
+"""Compares lanes with the true lines of a rendered drive."""
 
 from __future__ import annotations
 
@@ -20,21 +20,23 @@ from birdslam.sources.shipped_drive import DemoRecording
 
 
 class DriveReport(msgspec.Struct, frozen=True, kw_only=True):
-    """Lines, lanes, and vehicles in them."""
+    """The scores of lines and of vehicles in lanes."""
 
     lines: LinesReport
     vehicles: VehiclesReport
 
 
 def evaluate_drive(configuration: Configuration, drive: str) -> DriveReport:
-    """Drives through a rendered drive (`demo:DIR`) and compares each frame; writes report.json to the output.
+    """Processes a rendered drive (`demo:DIR`) and compares each frame; writes report.json to the output.
 
     Raises ConfigurationError, DatasetError, ModelError, ResultsError.
     """
     configuration = configuration.as_lossless()
     recording = open_recorded(recording_uri(drive), configuration.camera, configuration.source.stride)
     if not isinstance(recording, DemoRecording) or not recording.has_lines:
-        raise DatasetError(f"{drive}: has no true lines: `python -m perf roads --keep DIR` renders drives that have")
+        raise DatasetError(
+            f"{drive}: has no true lines; `python -m perf roads --keep DIR` renders drives with true lines"
+        )
     output = Path(configuration.output)
     claim_directory(output)
     source = RecordedSource(recording, configuration.source)
@@ -52,7 +54,7 @@ def evaluate_drive(configuration: Configuration, drive: str) -> DriveReport:
             truth = recording.truth_lines(frame.frame_id)
             lines.add(frame.t_source_ns * 1e-9, estimate.lanes, truth)
             vehicles.add(estimate, recording.truth_bodies(frame.frame_id), truth)
-    way_m = float(np.linalg.norm(np.diff(recording.truth_poses()[:, :3, 3], axis=0), axis=1).sum())
-    report = DriveReport(lines=lines.report(recording.name, way_m), vehicles=vehicles.report())
+    path_m = float(np.linalg.norm(np.diff(recording.truth_poses()[:, :3, 3], axis=0), axis=1).sum())
+    report = DriveReport(lines=lines.report(recording.name, path_m), vehicles=vehicles.report())
     write_json(output / "report.json", report)
     return report

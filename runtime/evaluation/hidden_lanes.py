@@ -1,4 +1,4 @@
-"""The road behind vehicles against what later frames of the drive show of it."""
+"""Compares the completed road behind vehicles with observations of later frames."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from birdslam.types import INVALIDATING
 
 
 def evaluate_hidden(configuration: Configuration, drive: str) -> HiddenReport:
-    """Drives through a recording; writes report.json and a picture of the frame where most was recovered (Fig. 4).
+    """Processes a recording; writes report.json and a picture of the frame with the most completed cells (Fig. 4).
 
     Raises ConfigurationError, DatasetError, ModelError, ResultsError.
     """
@@ -50,7 +50,7 @@ def evaluate_hidden(configuration: Configuration, drive: str) -> HiddenReport:
                 raise ConfigurationError("--model: no network segments road and lanes")
             if perception.ages.get("segmenter", 0):
                 continue
-            if estimate.epoch != epoch:  # another world: what was seen of the old one judges nothing any more
+            if estimate.epoch != epoch:  # the transform to the previous world is unknown
                 epoch, images = estimate.epoch, {}
                 cells = HiddenCells(recording.camera, lanes, shipped_completion(lanes.shape))
             boxes = np.zeros((0, 4)) if perception.detections is None else perception.detections.boxes_px

@@ -1,4 +1,4 @@
-"""What the lanes of one frame are made of, as a picture (Fig. 4 of the paper)."""
+"""Draws the cells and lanes of one frame (Fig. 4 of the paper)."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ from birdslam.slam import BirdSLAM
 
 
 def draw_frame_lanes(configuration: Configuration, drive: str, frame_id: int | None) -> Path:
-    """Drives to the frame (None: the last) and draws it; gives the picture's file.
+    """Processes a drive up to the frame (None: the last), draws it, and returns the path of the picture.
 
-    `drive`: a KITTI directory or a source's URI. Raises ConfigurationError, DatasetError, ResultsError.
+    `drive`: a KITTI directory or the URI of a source. Raises ConfigurationError, DatasetError, ResultsError.
     """
     configuration = configuration.as_lossless()
     recording = open_recorded(recording_uri(drive), configuration.camera, configuration.source.stride)
     frames = len(recording)
-    asked = frame_id if frame_id is not None else max(frames - 1, 0)
-    if not 0 <= asked < max(frames, 1):
-        raise ConfigurationError(f"--frame {asked}: {recording.name} has {frames} frames")
+    target = frame_id if frame_id is not None else max(frames - 1, 0)
+    if not 0 <= target < max(frames, 1):
+        raise ConfigurationError(f"--frame {target}: {recording.name} has {frames} frames")
     output = Path(configuration.output)
     claim_directory(output)
     source = RecordedSource(recording, configuration.source)
-    path = output / f"lanes_{recording.name}_{asked}.png"
+    path = output / f"lanes_{recording.name}_{target}.png"
     with (
         Inference(complete(configuration, recording.camera, source.rate_hz)) as inference,
-        Progress(recording.name, asked + 1) as progress,
+        Progress(recording.name, target + 1) as progress,
     ):
         slam = BirdSLAM(recording.camera, inference.networks, configuration.slam, lane_head=inference.lane_head)
         for frame in offline_frames(source):
             slam.step(frame)
             progress.advance()
-            if frame.frame_id == asked:
+            if frame.frame_id == target:
                 if frame.image is None:
-                    raise ConfigurationError(f"--frame {asked}: the image of {recording.name} can't be read")
-                title = f"{recording.name}, frame {asked}"
+                    raise ConfigurationError(f"--frame {target}: the image of {recording.name} can't be read")
+                title = f"{recording.name}, frame {target}"
                 draw_lanes(title, frame.image, slam.frontend.lane_view(), configuration.slam.frontend.lanes, path)
                 break
     return path

@@ -1,4 +1,4 @@
-"""Where the front end puts the labelled cars of KITTI tracking, and how each sequence fares without its own vote."""
+"""Position errors of the labelled road users of KITTI tracking, and leave-one-out cross-validation of constants."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from birdslam.types import Measurements
 
 
 class Sweep(NamedTuple):
-    """A constant of the front end, its present value, and a front end for each value of the sweep."""
+    """A constant of the front end, its present value, and a configuration for each value of the sweep."""
 
     key: str
     as_it_is: str
@@ -50,10 +50,10 @@ def evaluate_localisation(
     tilt_from_images: bool = False,
     draws: int = 1,
 ) -> tuple[list[LocalisationRow], list[TiltRow], list[MoversRow]]:
-    """The errors of the placed cars by range, of the roads that they were placed on, and false movers.
+    """Returns position errors of cars by range, errors of the road tilt, and false movers.
 
-    `detections`: "rrc" or a folder as det_02_rrc; `tilt_from_images` as in `measure`, whose error is drawn `draws`
-    times: all draws count together. Raises DatasetError.
+    `detections`: "rrc" or a directory with files as in det_02_rrc. `tilt_from_images`: as in `measure`; its error is
+    drawn `draws` times and all draws are pooled. Raises DatasetError.
     """
     sequences = [open_tracking(root, name, CAMERA_OF_BOXES) for name in names]
     with Progress("localisation", draws * sum(map(len, sequences))) as progress:
@@ -82,9 +82,9 @@ def evaluate_localisation(
 def evaluate_people(
     root: Path, names: Sequence[str], detections: str, config: FrontEndConfig, kind: str, tilt_from_images: bool = False
 ) -> tuple[list[PeopleRow], list[TracksRow]]:
-    """The errors of placed pedestrians or cyclists by range, and their tracks in bird's-eye view.
+    """Returns position errors of pedestrians or cyclists by range, and their tracks in bird's-eye view.
 
-    Sequences without labels of the kind are left out. Raises DatasetError.
+    Skips sequences without labels of the class. Raises DatasetError.
     """
     logs = _logs_of_people(root, names, detections, config, kind, tilt_from_images)
     return summarise_people([judge(sequence, log, kind) for sequence, log in logs])
@@ -93,7 +93,7 @@ def evaluate_people(
 def evaluate_classes(
     root: Path, names: Sequence[str], detections: str, config: FrontEndConfig, tilt_from_images: bool = False
 ) -> list[TracksRow]:
-    """How good the tracks of each class are, in bird's-eye view and in the image. Raises DatasetError."""
+    """Returns tracking metrics of each class, in bird's-eye view and in the image. Raises DatasetError."""
     rows: list[TracksRow] = []
     for kind in KINDS:
         tracks = [
@@ -109,7 +109,7 @@ def evaluate_classes(
 def _logs_of_people(
     root: Path, names: Sequence[str], detections: str, config: FrontEndConfig, kind: str, tilt_from_images: bool
 ) -> Iterator[tuple[TrackingSequence, list[Measurements]]]:
-    """The sequences with labels of a kind, with the front end's records of them."""
+    """Yields the sequences with labels of a class and the measurements of the front end."""
     sequences = [open_tracking(root, name, CAMERA_OF_BOXES) for name in names]
     sequences = [sequence for sequence in sequences if has_labels(sequence, kind)]
     if not sequences:
@@ -130,13 +130,13 @@ def evaluate_left_out(
     tilt_from_images: bool = False,
     kind: str = "car",
 ) -> list[LeftOut]:
-    """How each sequence fares by the value that the others choose, for each sweep. Raises ConfigurationError."""
+    """Evaluates each sequence with the value that the other sequences select, per sweep. Raises ConfigurationError."""
     sequences = [open_tracking(root, name, CAMERA_OF_BOXES) for name in names]
     sequences = [sequence for sequence in sequences if has_labels(sequence, kind)]
     drives = 1 + sum(len(sweep.by_value) - 1 for sweep in sweeps)
     rows: list[LeftOut] = []
     with Progress("localisation", drives * sum(map(len, sequences))) as progress:
-        as_they_are = _errors(root, sequences, detections, config, progress.advance, kind, tilt_from_images)
+        present = _errors(root, sequences, detections, config, progress.advance, kind, tilt_from_images)
         for key, as_it_is, by_value in sweeps:
             found = {
                 value: _errors(root, sequences, detections, varied, progress.advance, kind, tilt_from_images)
@@ -144,7 +144,7 @@ def evaluate_left_out(
                 if value != as_it_is
             }
             try:
-                rows += left_out(key, as_it_is, {as_it_is: as_they_are, **found})
+                rows += left_out(key, as_it_is, {as_it_is: present, **found})
             except ValueError as error:
                 raise ConfigurationError(f"--leave-one-out: {error}") from None
     return rows
@@ -168,7 +168,7 @@ def _errors(
 
 
 def _boxes(root: Path, detections: str, sequence: TrackingSequence, kind: str) -> list[Detections]:
-    """No detector's boxes of cyclists were recorded: those of the labels' hulls stand in."""
+    """Reads the boxes. RRC has no cyclists: their boxes are the projected labels."""
     found = read_detections(_folder(root, detections), sequence.name, len(sequence))
     return boxes_of_hulls(sequence, found, kind) if kind == "cyclist" and detections == "rrc" else found
 
@@ -178,7 +178,7 @@ def _folder(root: Path, detections: str) -> Path:
 
 
 def read_sweep(text: str, configuration: Configuration) -> Sweep:
-    """KEY=V1,V2 of `--leave-one-out`. Raises ConfigurationError."""
+    """Parses KEY=V1,V2 of `--leave-one-out`. Raises ConfigurationError."""
     key, _, values = text.partition("=")
     if not key.startswith("slam.frontend.") or not values:
         raise ConfigurationError(f"--leave-one-out {text}: expected slam.frontend.KEY=V1,V2")
@@ -188,7 +188,7 @@ def read_sweep(text: str, configuration: Configuration) -> Sweep:
     for parent in parents:
         branch = branch.get(parent) if isinstance(branch, dict) else None
     if not isinstance(branch, dict) or type(branch.get(leaf)) not in (int, float):
-        raise ConfigurationError(f"--leave-one-out {text}: {key} is no number of the configuration")
+        raise ConfigurationError(f"--leave-one-out {text}: {key} is not a number of the configuration")
     as_it_is, found = branch[leaf], {str(branch[leaf]): configuration.slam.frontend}
     for value in values.split(","):
         try:
@@ -200,16 +200,16 @@ def read_sweep(text: str, configuration: Configuration) -> Sweep:
 
 
 def sequences_of(root: Path, asked: str | None, known: Sequence[str] | None = None) -> list[str]:
-    """The sequences "0002,0003" of a KITTI tracking folder; None: those of `known` that it has, or all.
+    """Returns the names in "0002,0003"; None: those of `known` in the KITTI tracking folder, or all.
 
     Raises ConfigurationError, DatasetError.
     """
     labels = root / "label_02"
     if not labels.is_dir():
-        raise DatasetError(f"{root}: is no KITTI tracking folder: it has no label_02")
-    there = sorted(path.stem for path in labels.glob("*.txt"))
-    chosen = list(dict.fromkeys(asked.split(","))) if asked else [n for n in there if known is None or n in known]
-    missing = [name for name in chosen if name not in there]
+        raise DatasetError(f"{root}: not a KITTI tracking folder: label_02 is missing")
+    existing = sorted(path.stem for path in labels.glob("*.txt"))
+    chosen = list(dict.fromkeys(asked.split(","))) if asked else [n for n in existing if known is None or n in known]
+    missing = [name for name in chosen if name not in existing]
     if missing or not chosen:
         raise ConfigurationError(f"--sequences: {root} has no {', '.join(missing) or 'sequences'}")
     return chosen

@@ -1,4 +1,4 @@
-"""The whole method over recordings, in one process, against true poses and LiDAR."""
+"""Runs the method on recordings in one process and compares it with true poses and LiDAR."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from birdslam.types import Estimate, MapUpdate, Measurements
 
 
 def evaluate_odometry(configuration: Configuration, sequences: Sequence[str], compared: slice) -> list[OdometryReport]:
-    """Drives each sequence whole, holds the frames `compared` to its truth, and writes report.json and trajectories.
+    """Processes each sequence, compares the frames `compared` with the truth, writes report.json and trajectories.
 
-    `sequences`: KITTI directories or sources' URIs. Raises ConfigurationError, DatasetError, ResultsError.
+    `sequences`: KITTI directories or URIs of sources. Raises ConfigurationError, DatasetError, ResultsError.
     """
     source = configuration.source
     if source.frames is not None or source.loop:
-        raise ConfigurationError("source.frames, source.loop: evaluate takes whole recordings, once")
+        raise ConfigurationError("source.frames, source.loop: evaluate processes whole recordings once; remove both")
     recordings = [
         open_recorded(recording_uri(text), configuration.camera, source.stride, source.topics) for text in sequences
     ]
     twice = [name for name, n in Counter(recording.name for recording in recordings).items() if n > 1]
     if twice:
-        raise ConfigurationError(f"two sequences are named {twice[0]}: their results would overwrite each other")
+        raise ConfigurationError(f"two sequences have the name {twice[0]}; their results would overwrite each other")
     if source.speed:
         for recording in recordings:
             with_speeds(recording, of_sequence(speeds_of(configuration, len(recordings)), recording.name))

@@ -1,4 +1,4 @@
-"""The ego's lane in single images with masks: scores and pictures."""
+"""Compares the ego lane and lane markings in single images with masks."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ REPORT = "report.json"
 
 
 def evaluate_paint(configuration: Configuration, folder: Path) -> PaintReport:
-    """Scores the paint that the configured network finds in a folder's images; writes the report to the output.
+    """Scores the lane markings that the network segments in the images of a folder; writes the report.
 
     Raises ConfigurationError, DatasetError, ModelError, ResultsError.
     """
@@ -42,7 +42,7 @@ def evaluate_paint(configuration: Configuration, folder: Path) -> PaintReport:
         for image_path, mask_path in pairs:
             image, mask = read(image_path), read(mask_path)
             if image.shape != mask.shape:
-                raise DatasetError(f"{mask_path}: is of another size than its image")
+                raise DatasetError(f"{mask_path}: differs in size from its image")
             segmentation = inference.networks.start(0, image).result().segmentation
             if segmentation is None:
                 raise ConfigurationError("--model: no network segments road and lanes")
@@ -55,9 +55,9 @@ def evaluate_paint(configuration: Configuration, folder: Path) -> PaintReport:
 
 
 def evaluate_stills(configuration: Configuration, folder: Path, height_m: float | None) -> StillsReport:
-    """Scores all pairs of a folder, each image by itself; writes the report and a picture of each to the output.
+    """Scores all pairs of image and mask in a folder independently; writes the report and a picture of each.
 
-    The camera is the configuration's, or KITTI's; `height_m` overrides its height. Raises ConfigurationError,
+    The camera is that of the configuration or of KITTI; `height_m` overrides its height. Raises ConfigurationError,
     DatasetError, ModelError, ResultsError.
     """
     pairs = find_pairs(folder)
@@ -65,7 +65,7 @@ def evaluate_stills(configuration: Configuration, folder: Path, height_m: float 
     claim_directory(output)
     configuration = configuration.as_lossless()
     if configuration.camera is not None and configuration.camera.distortion:
-        raise ConfigurationError("--camera: the masks are of undistorted images: a camera without distortion is needed")
+        raise ConfigurationError("--camera: the masks fit undistorted images; use a camera without distortion")
     scores = []
     with Inference(configuration) as inference, Progress(folder.name, len(pairs)) as progress:
         heads = inference.networks.heads
@@ -75,7 +75,7 @@ def evaluate_stills(configuration: Configuration, folder: Path, height_m: float 
                 camera = camera_of(image, configuration.camera, height_m)
             except DatasetError as error:
                 raise DatasetError(f"{pair.image}: {error}") from None
-            perception = inference.networks.start(0, image).result()  # frame 0 again: nothing is carried
+            perception = inference.networks.start(0, image).result()  # always frame 0: no result is carried over
             if perception.segmentation is None:
                 raise ConfigurationError("--model: no network segments road and lanes")
             boxes = np.zeros((0, 4)) if perception.detections is None else perception.detections.boxes_px

@@ -1,7 +1,4 @@
-"""The paper's tables on KITTI tracking: which jobs there are, their outcomes, and the report of all.
-
-One process a sequence, each with everything that its sequence needs.
-"""
+"""The tables of the paper on KITTI tracking: the jobs, one process per sequence, and the report."""
 
 from __future__ import annotations
 
@@ -30,7 +27,7 @@ from birdslam.sources.kitti_tracking import camera_with_images
 PUBLISHED = Path(tables.__file__).with_name("published.toml")
 METHODS = tuple(every_method(SlamConfig()))
 
-OnDone = Callable[[Outcome, int, int, str], object]  # a job's outcome, how many are done, of how many, the time to go
+OnDone = Callable[[Outcome, int, int, str], object]  # outcome of a job, jobs done, all jobs, remaining time
 
 
 def jobs_of(
@@ -45,16 +42,16 @@ def jobs_of(
     detections: str = "",
     seeds: int = 1,
 ) -> list[Job]:
-    """The jobs of the sequences "0002,0003" (None: all at hand); `methods` None: the ablations alone.
+    """Returns the jobs of the sequences "0002,0003" (None: all). `methods` None: ablations only.
 
-    `frames`: "all", "paper" or "A:B"; `odometry` and `detections`: "" for what a sequence has. Raises
+    `frames`: "all", "paper" or "A:B". `odometry` and `detections`: "" selects by the files of a sequence. Raises
     ConfigurationError, DatasetError.
     """
     published = tables.read_published(PUBLISHED)
     names = sequences_of(root, sequences, [*published.sequences] if frames == "paper" else None)
     unknown = [name for name in methods or () if name not in METHODS]
     if unknown:
-        raise ConfigurationError(f"--methods: there is no {', '.join(unknown)}; there are {', '.join(METHODS)}")
+        raise ConfigurationError(f"--methods: unknown {', '.join(unknown)}; expected {', '.join(METHODS)}")
     jobs = [
         Job(
             root=root,
@@ -77,17 +74,17 @@ def jobs_of(
         simulated = set(names) - {job.sequence for job in jobs if job.odometry == "images"}
         if simulated:
             without = ", ".join(sorted(simulated))
-            raise ConfigurationError(f"--speed: the odometry of {without} fuses none; --odometry images does")
+            raise ConfigurationError(f"--speed: the odometry of {without} does not use a speed; add --odometry images")
     return jobs
 
 
 def _sources(
     root: Path, name: str, asked_odometry: str, asked_detections: str, tables: bool, configuration: Configuration
 ) -> list[tuple[str, str, bool]]:
-    """Odometry and detections of a sequence's jobs, and whether the ablations go with it.
+    """Returns odometry, detections and whether to run the ablations, for each job of a sequence.
 
-    Where nothing is asked for, a sequence with images is driven by these too, with the networks' own boxes. Raises
-    ConfigurationError where the images or the networks that are asked for are not there.
+    By default, a sequence with images has a second job with visual odometry and the boxes of the networks. Raises
+    ConfigurationError if required images or networks are missing.
     """
     camera = camera_with_images(root, name)
     boxes = (root / "det_02_rrc").is_dir()
@@ -98,19 +95,19 @@ def _sources(
     if tables and camera is not None and boxes and not asked_odometry and not asked_detections:
         out.append(("images", "network", False))
     for odometry, detections, _ in out:
-        own = detections == "network"
-        if own and camera is None:
+        by_network = detections == "network"
+        if by_network and camera is None:
             raise ConfigurationError(f"--detections network: {root} has no image_02 or image_03 of sequence {name}")
-        if odometry == "images" and not own and camera != CAMERA_OF_BOXES:
+        if odometry == "images" and not by_network and camera != CAMERA_OF_BOXES:
             which = "no image_02" if camera is None else f"no image_02, whose boxes these are, but image_{camera:02d},"
             raise ConfigurationError(f"--odometry images: {root} has {which} of sequence {name}")
-        if own and not {"detector", "multitask"} & set(configuration.models.in_use()):
-            raise ConfigurationError("--detections network: needs a network that detects: --model detector=PATH")
+        if by_network and not {"detector", "multitask"} & set(configuration.models.in_use()):
+            raise ConfigurationError("--detections network: needs a detector; add --model detector=PATH")
     return out
 
 
 def run_jobs(jobs: Sequence[Job], processes: int, on_done: OnDone) -> list[Outcome]:
-    """Every job in a process of its own, several at once; the outcomes by sequence."""
+    """Runs each job in its own process, several in parallel; returns the outcomes ordered by sequence."""
     begun_s, outcomes = time.monotonic(), []
 
     def take(outcome: Outcome) -> None:
@@ -127,7 +124,7 @@ def run_jobs(jobs: Sequence[Job], processes: int, on_done: OnDone) -> list[Outco
                 take(outcome)
     else:
         with workers(min(processes, len(jobs))) as pool:
-            # The longest first: a long one that begins last is waited for alone
+            # Longest first, so that no long job runs alone at the end
             running = [pool.submit(run_sequence, job) for job in sorted(jobs, key=frames_to_make, reverse=True)]
             for done in as_completed(running):
                 take(done.result())
@@ -135,7 +132,7 @@ def run_jobs(jobs: Sequence[Job], processes: int, on_done: OnDone) -> list[Outco
 
 
 def write_report(jobs: Sequence[Job], outcomes: Sequence[Outcome], output: Path) -> str:
-    """Writes report.md and what it is made of, as JSON and pictures; gives the report."""
+    """Writes report.md with its data as JSON and its pictures; returns the report."""
     job = jobs[0]
     rows = [row for outcome in outcomes for row in outcome.rows]
     variants = [row for outcome in outcomes for row in outcome.ablation]

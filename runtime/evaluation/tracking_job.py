@@ -1,4 +1,4 @@
-"""One sequence of KITTI tracking in a process of its own: all methods, the ablations, the clock and the picture."""
+"""One sequence of KITTI tracking in one process: methods, ablations, timings and picture."""
 
 from __future__ import annotations
 
@@ -52,37 +52,37 @@ from birdslam.sources.speed_file import of_sequence, read_speeds
 from birdslam.trajectory import as_poses, inverse, read_kitti
 from birdslam.types import Estimate, Measurements
 
-# The paper's graph on a log of its own placing of vehicles, on images of its whole front end
+# The graph of the paper with its localization of vehicles (Eq. 1), and on images with its whole front end
 BY_EQ_1: dict[str, Method] = {"paper_eq1": PAPER, "paper_eq1_final": methods(AS_PUBLISHED)["paper_final"]}
-FIGURE_FRAMES = (50, 100, 200, 414)  # of the paper's figure of times
-BATCHES = frozenset({"batch_se3", "nair"})  # the methods that the figure of times is about
-REPEATS = 3  # of each time: the median counts
+FIGURE_FRAMES = (50, 100, 200, 414)  # of the runtime figure of the paper
+BATCHES = frozenset({"batch_se3", "nair"})  # the batch methods of the runtime figure
+REPEATS = 3  # of each timing; the median is reported
 
 
 @dataclass(frozen=True)
 class Job:
-    """What one sequence's process works on."""
+    """The work of one process: a sequence with its settings."""
 
     root: Path
     sequence: str
     frames: str  # "all", "paper" or "A:B"
-    methods: tuple[str, ...]  # those of Tables 1 and 2; none: the ablations alone
+    methods: tuple[str, ...]  # of Tables 1 and 2; none: ablations only
     odometry: str
     detections: str
     seeds: int
-    ablate: bool  # the variants of Tables 3-5 too
+    ablate: bool  # also run the variants of Tables 3-5
     output: Path
     configuration: Configuration
     published: Published
 
     @property
     def camera(self) -> int | None:
-        """Whose images and boxes count: with the networks' boxes that which has images."""
+        """The camera of the boxes; None: the camera that has images."""
         return None if self.detections == "network" else CAMERA_OF_BOXES
 
 
 def frames_of(text: str, sequence: TrackingSequence, published: Published) -> range:
-    """The frames that `--frames` names. Raises ConfigurationError."""
+    """Parses `--frames`. Raises ConfigurationError."""
     if text == "all":
         return range(len(sequence))
     if text == "paper":
@@ -103,14 +103,14 @@ def frames_of(text: str, sequence: TrackingSequence, published: Published) -> ra
 
 
 def frames_to_make(job: Job) -> int:
-    """How many frames the front end goes through for a job, seeds and logs together."""
+    """Returns the number of frames that the front end processes for a job, over all seeds and logs."""
     frames = frames_of(job.frames, open_tracking(job.root, job.sequence, job.camera), job.published)
     logs = 1 + bool(_by_eq_1(job)) + bool(_ideas(job) and job.odometry == "images")
     return len(frames) * job.seeds * logs
 
 
 def run_sequence(job: Job, frame_made: Callable[[], object] = lambda: None) -> Outcome:
-    """All methods and ablations on one sequence; `frame_made` is called after each frame of the front end."""
+    """Runs all methods and ablations on one sequence; calls `frame_made` after each frame of the front end."""
     cv2.setNumThreads(1)
     sequence = open_tracking(job.root, job.sequence, job.camera)
     frames = frames_of(job.frames, sequence, job.published)
@@ -120,7 +120,7 @@ def run_sequence(job: Job, frame_made: Callable[[], object] = lambda: None) -> O
     by_eq_1, ideas = _by_eq_1(job), _ideas(job)
     paper = job.published.sequences.get(sequence.name)
     bodies = () if paper is None else paper.bodies
-    named = bodies if job.frames == "paper" else None  # of the ablations; else of all
+    named = bodies if job.frames == "paper" else None  # bodies of the ablations; None: all
     trials, ablations, worth, nees, log = [], [], [], [], []
     with ExitStack() as stack:
         make = _log_maker(job, sequence, frames, stack, frame_made)
@@ -146,7 +146,7 @@ def run_sequence(job: Job, frame_made: Callable[[], object] = lambda: None) -> O
                 if chosen:
                     trials[-1] = replace(trials[-1], errors={**trials[-1].errors, **theirs.errors})
             if ideas:
-                if job.odometry == "images":  # no idea of the odometry is among them: it is ours throughout
+                if job.odometry == "images":  # the variants do not change the odometry
                     placing = msgspec.structs.replace(AS_PUBLISHED.frontend, odometry=slam.frontend.odometry)
                     published_log, published = make(seed, placing), {}
                 theirs = run_trial(sequence, published_log, ideas, named, published)
@@ -183,7 +183,7 @@ def run_sequence(job: Job, frame_made: Callable[[], object] = lambda: None) -> O
 
 
 def _by_eq_1(job: Job) -> dict[str, Method]:
-    """None where methods are named and ours or the paper's is not among them."""
+    """Returns BY_EQ_1 if both our method and that of the paper run."""
     return {} if job.methods and not {"paper", "birdslam"} <= set(job.methods) else dict(BY_EQ_1)
 
 
@@ -194,9 +194,9 @@ def _ideas(job: Job) -> dict[str, Method]:
 
 
 def _lengths(log: Sequence[Measurements], job: Job) -> list[int]:
-    """Of the sequence that the paper states its times for, the frames of its figure; of the others all.
+    """Returns the frame counts for timings: those of the figure for the sequence of the paper, else all frames.
 
-    None where methods are named and no batch is among them.
+    Empty if no batch method runs.
     """
     if job.methods and BATCHES.isdisjoint(job.methods):
         return []
@@ -206,9 +206,9 @@ def _lengths(log: Sequence[Measurements], job: Job) -> list[int]:
 
 
 def _timing(log: Sequence[Measurements], job: Job) -> Timing:
-    """All updates of the live graph, and one solve of either batch: medians over REPEATS.
+    """Times all updates of the live graph and one solve of each batch method, as medians over REPEATS.
 
-    A batch that has not converged, which may take minutes, is solved once: nothing is made of its time.
+    A batch that does not converge is solved once, since its time is not reported.
     """
     batches = []
     for config in (batch_se3.CONFIG, nair.CONFIG):
@@ -227,10 +227,10 @@ def _timing(log: Sequence[Measurements], job: Job) -> Timing:
 
 
 def _variants(job: Job) -> dict[str, Method]:
-    """The ablations by "METHOD/VARIANT"; of Table 5 by the variant alone."""
+    """Returns the ablations as "METHOD/VARIANT"; those of Table 5 as "VARIANT"."""
     out: dict[str, Method] = {}
     images = job.odometry == "images"
-    if not job.ablate:  # these have their rows by another log of the sequence, but lanes are in the images' alone
+    if not job.ablate:  # another job of the sequence has these rows, but only images have lanes
         return ablation.lane_variants(images) if images and "batch_se3" in job.methods else out
     for name, base in (("paper", PAPER), ("birdslam", ours(job.configuration.slam))):
         if not job.methods or name in job.methods:
@@ -245,9 +245,9 @@ def _variants(job: Job) -> dict[str, Method]:
 def _log_maker(
     job: Job, sequence: TrackingSequence, frames: range, stack: ExitStack, frame_made: Callable[[], object]
 ) -> Callable[[int, FrontEndConfig], list[Measurements]]:
-    """Gives the log of a seed."""
+    """Returns a function that makes the log of a seed."""
     paths = {} if sequence.images is None else find_images(sequence.images)
-    looks = job.odometry == "images" or job.detections == "network"
+    uses_images = job.odometry == "images" or job.detections == "network"
 
     def image_of(frame: int) -> NDArray[np.uint8] | None:
         try:
@@ -255,8 +255,8 @@ def _log_maker(
         except (KeyError, ValueError):
             return None
 
-    beside = job.configuration.source.speed if job.odometry == "images" else ""
-    speeds = read_speeds(of_sequence(Path(beside).expanduser(), sequence.name)) if beside else None
+    speed_path = job.configuration.source.speed if job.odometry == "images" else ""
+    speeds = read_speeds(of_sequence(Path(speed_path).expanduser(), sequence.name)) if speed_path else None
     network = job.detections == "network"
     folder = job.root / "det_02_rrc" if job.detections == "rrc" else Path(job.detections)
     found = [] if network else read_detections(folder, sequence.name, len(sequence))
@@ -282,14 +282,14 @@ def _log_maker(
             frame_made()
             return perceive(frame, image)
 
-        looked = image_of if looks else None
-        return make_log(sequence, frames, odometry, counted, looked, config, speeds, frustum_network, lane_head)
+        images = image_of if uses_images else None
+        return make_log(sequence, frames, odometry, counted, images, config, speeds, frustum_network, lane_head)
 
     return make
 
 
 def _odometry(job: Job, sequence: TrackingSequence, frames: range, rng: np.random.Generator) -> EgoMotion | None:
-    """None: the front end's own, from the images."""
+    """Returns the ego motion; None: visual odometry of the front end."""
     truth = sequence.camera_poses
     if job.odometry == "images":
         return None
@@ -303,7 +303,7 @@ def _odometry(job: Job, sequence: TrackingSequence, frames: range, rng: np.rando
         rows = as_poses(read_kitti(path))
     except ValueError as error:
         raise DatasetError(str(error)) from None
-    if len(rows) == len(frames) < len(sequence):  # of the frames asked for alone
+    if len(rows) == len(frames) < len(sequence):  # the file has only the requested frames
         rows = np.concatenate([np.tile(rows[:1], (frames.start, 1, 1)), rows])
     if len(rows) < frames.stop:
         raise DatasetError(f"{path}: {len(rows)} poses for {len(frames)} frames of sequence {sequence.name}")
@@ -312,7 +312,7 @@ def _odometry(job: Job, sequence: TrackingSequence, frames: range, rng: np.rando
 
 
 def _one_vehicle(log: Sequence[Measurements]) -> list[Measurements]:
-    """The log with the vehicle alone that is seen most."""
+    """Returns the log with only the vehicle that has the most edges."""
     seen = [edge.vehicle for m in log for edge in m.cv]
     most_seen = max(sorted(set(seen)), key=seen.count, default=-1)
     return [
@@ -324,7 +324,7 @@ def _one_vehicle(log: Sequence[Measurements]) -> list[Measurements]:
 
 
 def _estimates(log: Sequence[Measurements], job: Job) -> list[Estimate]:
-    """The live estimate of each frame."""
+    """Returns the live estimate of each frame."""
     graph = PoseGraph(job.configuration.slam.graph, job.configuration.slam.weights)
     return [graph.optimise(measurements) for measurements in log]
 

@@ -45,7 +45,7 @@ _NAMES: dict[type[kinds.Type], str] = {
 
 @dataclass(frozen=True)
 class Key:
-    """One row: a key of the configuration."""
+    """A row of the page: one key of the configuration."""
 
     key: str
     meaning: str
@@ -55,7 +55,7 @@ class Key:
 
 
 def page() -> str:
-    """The whole page, in Markdown."""
+    """Returns the page in Markdown."""
     return _PAGE.format(count=len(KEYS), groups="\n\n".join(map(_markdown, GROUPS)))
 
 
@@ -75,7 +75,7 @@ def _markdown(group: Group) -> str:
 
 
 def _default(alike: list[Field]) -> str:
-    """Of a key, or of each that a pattern stands for where they differ: "detector 5.0, depth 2.0"."""
+    """Returns the default of a key, or the different ones of a pattern: "detector 5.0, depth 2.0"."""
     values = {field.key: _value(field.default) for field in alike}
     if isinstance(alike[0].default, ByName):
         return ", ".join(f"{name} {_value(value)}" for name, value in alike[0].default.items())
@@ -91,7 +91,7 @@ def _value(value: Any) -> str:
 
 
 def _may_be(kind: kinds.Type) -> str:
-    """What a value may be, as the type states it."""
+    """Returns the allowed values of a type."""
     if isinstance(kind, kinds.UnionType):
         return " or ".join(map(_may_be, kind.types))
     if isinstance(kind, kinds.LiteralType):
@@ -99,7 +99,7 @@ def _may_be(kind: kinds.Type) -> str:
     if isinstance(kind, kinds.VarTupleType):
         return f"list of {_may_be(kind.item_type)}"
     bounds = [("ge", ">="), ("gt", ">"), ("le", "<="), ("lt", "<")]
-    said = [f"{sign} {limit:g}" for name, sign in bounds if (limit := getattr(kind, name, None)) is not None]
+    parts = [f"{sign} {limit:g}" for name, sign in bounds if (limit := getattr(kind, name, None)) is not None]
     if pattern := getattr(kind, "pattern", None):
-        said.append(f"`{pattern}`")
-    return f"{_NAMES[type(kind)]} {' and '.join(said)}".strip()
+        parts.append(f"`{pattern}`")
+    return f"{_NAMES[type(kind)]} {' and '.join(parts)}".strip()

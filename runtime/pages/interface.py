@@ -73,7 +73,7 @@ On the wire a pose `T_a_b`, that of b in a, is `[x_m, y_m, yaw_rad]`.
 
 
 def page() -> str:
-    """The last sections of the page, in Markdown."""
+    """Returns the generated sections of docs/planner.md in Markdown."""
     budgets = BudgetsConfig()
     return _PAGE.format(
         bytes=MAX_MESSAGE_BYTES,
@@ -134,7 +134,7 @@ def _records() -> Iterator[str]:
 
 
 def _with_parts(records: Iterable[type[msgspec.Struct]]) -> list[type[msgspec.Struct]]:
-    """Each record once, followed by those that its fields hold."""
+    """Returns each record once, followed by the records of its fields."""
     found: dict[type[msgspec.Struct], None] = {}
 
     def add(kind: Any) -> None:
@@ -159,8 +159,8 @@ def _fields(record: type[msgspec.Struct]) -> Iterator[tuple[str, ...]]:
     for field in msgspec.structs.fields(record):
         transform = _TRANSFORM.fullmatch(field.name)
         pose = f"the pose of {transform[2]} in {transform[1]}" if transform else ""
-        said = own.get(field.name) or (everywhere[field.name] if kinds.get(field.name) == field.type else "")
-        meaning = f"{pose}: {said}" if pose and said else pose or said
+        comment = own.get(field.name) or (everywhere[field.name] if kinds.get(field.name) == field.type else "")
+        meaning = f"{pose}: {comment}" if pose and comment else pose or comment
         default = "" if field.required else f"`{_plain(field)}`"
         yield f"`{field.name}`", _type(field.type), unit(field.name), default, meaning
 
@@ -171,7 +171,7 @@ def _plain(field: Any) -> str:
 
 
 def _type(kind: Any) -> str:
-    """For a reader in any language."""
+    """Returns the name of a type, independent of the language of the reader."""
     origin, inner = typing.get_origin(kind), typing.get_args(kind)
     if origin is typing.Annotated:
         limits = next((a for a in inner[1:] if isinstance(a, msgspec.Meta)), msgspec.Meta())

@@ -1,4 +1,4 @@
-"""The tables of docs/sources.md, from the table of schemes: `birdslam sources` prints them."""
+"""The tables of docs/sources.md, generated from the schemes; `birdslam sources` prints them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ uses the first source that recognises it; `calibrate` and `evaluate` take such a
 
 
 def page() -> str:
-    """The last section of the page, in Markdown."""
+    """Returns the generated section of docs/sources.md in Markdown."""
     schemes = all_schemes()
     what = [("source", "what it is", "frames", "camera", "clock"), *map(_what, schemes)]
     takes = [

@@ -1,4 +1,4 @@
-"""What the pages that commands write (`birdslam interface`, `birdslam configuration`) take from the code."""
+"""Units, comments and Markdown tables for the pages that are generated from the code."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import tokenize
 from collections.abc import Iterable
 from functools import cache
 
-UNITS = {  # by the end of a field's name; the longer ends first
+UNITS = {  # by the suffix of a field name; longer suffixes first
     "_rad_per_sqrt_m": "rad/m^0.5",
     "_rel_per_sqrt_m": "fraction/m^0.5",
     "_rad_per_m": "rad/m",
@@ -35,14 +35,14 @@ UNITS = {  # by the end of a field's name; the longer ends first
 
 
 def unit(name: str) -> str:
-    """The unit by the suffix of a field's name; "" where it has none."""
-    return next((said for end, said in UNITS.items() if name.endswith(end)), "")
+    """Returns the unit by the suffix of a field name, or ""."""
+    return next((symbol for suffix, symbol in UNITS.items() if name.endswith(suffix)), "")
 
 
 def comments(kind: type) -> dict[str, str]:
-    """Field -> what its class's source says of it: the comment on its line, else those on the lines right above it.
+    """Returns field -> comment in the source: the comment on its line, or else those directly above it.
 
-    Fields of the base classes are among them. A field without a comment is missing.
+    Includes the fields of base classes; fields without a comment are missing.
     """
     found: dict[str, str] = {}
     for base in reversed(kind.__mro__):
@@ -52,7 +52,7 @@ def comments(kind: type) -> dict[str, str]:
 
 
 def table(rows: Iterable[tuple[str, ...]]) -> str:
-    """Markdown; the first row is the head."""
+    """Returns a Markdown table; the first row is the head."""
     head, *body = rows
     lines = [head, ("---",) * len(head), *body]
     return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in lines)
@@ -61,10 +61,10 @@ def table(rows: Iterable[tuple[str, ...]]) -> str:
 @cache
 def _own_comments(kind: type) -> dict[str, str]:
     source = textwrap.dedent(inspect.getsource(kind))
-    said, alone = {}, set()
+    texts, alone = {}, set()
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type == tokenize.COMMENT:
-            said[token.start[0]] = token.string.lstrip("# ")
+            texts[token.start[0]] = token.string.lstrip("# ")
             if token.line.lstrip().startswith("#"):
                 alone.add(token.start[0])
     (tree,) = ast.parse(source).body
@@ -74,12 +74,12 @@ def _own_comments(kind: type) -> dict[str, str]:
         target = node.target if isinstance(node, ast.AnnAssign) else getattr(node, "targets", [None])[0]
         if not isinstance(target, ast.Name):
             continue
-        lines = [line for line in range(node.lineno, (node.end_lineno or node.lineno) + 1) if line in said]
+        lines = [line for line in range(node.lineno, (node.end_lineno or node.lineno) + 1) if line in texts]
         if not lines:
             above = node.lineno - 1
             while above in alone:
                 lines.insert(0, above)
                 above -= 1
         if lines:
-            found[target.id] = " ".join(said[line] for line in lines)
+            found[target.id] = " ".join(texts[line] for line in lines)
     return found
