@@ -1,5 +1,5 @@
-"""`make train` and `birdslam demo-drive`: the shipped networks from their seeds, and the shipped drive.
+"""Trains the shipped networks (`make train`) and renders the shipped drive (`birdslam demo-drive`).
 
-Read `train` first (the multi-task network); `train_lanes` and `train_pointnet` train the other two, `quantise` makes
-the int8 network.
+`train` trains the multi-task network, `train_lanes` and `train_pointnet` the other two; `quantise` makes the int8
+network.
 """

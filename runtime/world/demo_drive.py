@@ -1,4 +1,4 @@
-"""Rendering the shipped drive again, and writing it as `DemoRecording` reads it."""
+"""Renders the shipped drive and writes it in the format of `DemoRecording`."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from birdslam.sources.shipped_drive import COLUMNS, LABELS, LINE_COLUMNS, LINE_K
 if TYPE_CHECKING:
     from birdslam.world.truth import WorldFrame
 
-LINES_TO_M, LINE_STEP_M = 60.0, 2.0  # of the true lines
-SAMPLES = 2  # of a pixel, across and down
+LINES_TO_M, LINE_STEP_M = 60.0, 2.0  # extent and spacing of the true lines
+SAMPLES = 2  # per pixel, horizontally and vertically
 CAMERA_KEYS = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px", "height_m", "pitch_rad", "roll_rad")
 
 
 def make(directory: Path, frames: int | None, quality: int) -> int:
-    """Renders the first `frames` (None: all) with progress on standard error; gives how many.
+    """Renders the first `frames` (None: all) with progress on standard error; returns their number.
 
-    `quality` is that of the WebP images, 1 to 100. Raises DatasetError for other numbers, and without the renderer.
+    `quality` of the WebP images is 1 to 100. Raises DatasetError for values out of range or without the renderer.
     """
     try:
         from birdslam.world.demo_world import CAMERA, FRAMES, RATE_HZ, demo_scenario
@@ -45,7 +45,7 @@ def make(directory: Path, frames: int | None, quality: int) -> int:
 
 
 def write(directory: Path, frames: Iterable[WorldFrame], camera: Camera, rate_hz: float, quality: int) -> None:
-    """Write a rendered drive so that `DemoRecording` reads it; `quality` is WebP's, 1 to 100."""
+    """Writes a rendered drive; `quality` of the WebP images is 1 to 100."""
     images: list[bytes] = []
     poses: list[Floats] = []
     ground: list[tuple[float, float, float]] = []
@@ -73,12 +73,12 @@ def write(directory: Path, frames: Iterable[WorldFrame], camera: Camera, rate_hz
 def _webp(image: NDArray[np.uint8], quality: int) -> bytes:
     ok, data = cv2.imencode(".webp", image, [cv2.IMWRITE_WEBP_QUALITY, quality])
     if not ok:
-        raise DatasetError("this OpenCV can't write WebP")
+        raise DatasetError("this build of OpenCV can't write WebP")
     return data.tobytes()
 
 
 def _rows(frame: WorldFrame) -> Iterator[tuple[float, ...]]:
-    """One of COLUMNS for each body in the frame; velocities turned to ego's axes."""
+    """Yields a row of COLUMNS per body in the frame, with velocities in ego."""
     forward = frame.T_world_cam[:2, 2] / np.linalg.norm(frame.T_world_cam[:2, 2])
     for body in frame.objects:
         along = float(forward @ body.velocity_mps)
@@ -92,7 +92,7 @@ def _rows(frame: WorldFrame) -> Iterator[tuple[float, ...]]:
 
 
 def _line_rows(frame: WorldFrame) -> Floats:
-    """Rows of LINE_COLUMNS: the points of each line from the ego to LINES_TO_M ahead."""
+    """Returns rows of LINE_COLUMNS: the points of each line from the ego to LINES_TO_M ahead."""
     rows = [np.zeros((0, len(LINE_COLUMNS)))]
     for lane in frame.lanes:
         x = lane.points_m[:, 0]
@@ -108,6 +108,6 @@ def _spacing_m(points_m: Floats) -> float:
 
 
 def _toml(camera: Camera) -> str:
-    lines = ["# The camera of a rendered drive; its springs move it about this height, pitch and roll"]
+    lines = ["# The camera of a rendered drive. The suspension moves it around this height, pitch and roll"]
     lines += [f"{name} = {getattr(camera, name)}" for name in CAMERA_KEYS]
     return "\n".join(lines) + "\n"

@@ -1,10 +1,9 @@
-"""A multi-task network in int8 beside the one in fp32: smaller, and faster where the processor has the instructions.
+"""Quantizes a multi-task network to int8. Needs the extra [train].
 
     python -m birdslam.runtime.world.quantise NETWORK.onnx [--frames 128] [--output DIR]
 
-Ranges come of rendered frames that neither training draws nor the figures are of. The last convolution of each head
-stays in fp32, or masks lose their edges; weights take seven bits (reduce_range), so that AVX2 without VNNI
-doesn't overflow. Needs [train].
+The ranges are calibrated on rendered frames outside the training and test sets. The last convolution of each head
+stays in fp32 for accurate mask edges. Weights have seven bits (reduce_range), so that AVX2 does not overflow.
 """
 
 from __future__ import annotations
@@ -31,14 +30,14 @@ from birdslam.world.training.validation import VALIDATION_SEEDS
 
 
 class Frames(CalibrationDataReader):
-    """Rendered frames as the network takes them."""
+    """Rendered frames as network inputs."""
 
     def __init__(self, size: Input, count: int) -> None:
         self._size, self._preparation = size, Preparation(size)
         self._seeds = iter(range(VALIDATION_SEEDS, VALIDATION_SEEDS + count))
 
     def get_next(self) -> dict[str, Floats32] | None:
-        """The next input; None at the end."""
+        """Returns the next input; None at the end."""
         from birdslam.world.world import sample
 
         seed = next(self._seeds, None)
@@ -52,7 +51,7 @@ class Frames(CalibrationDataReader):
 
 
 def quantise(network: Path, frames: int) -> tuple[bytes, str]:
-    """The network's int8 twin and its manifest."""
+    """Returns the int8 network and its manifest."""
     source = network.with_suffix(".toml")
     with tempfile.TemporaryDirectory(prefix="quantise") as folder:
         prepared, result = Path(folder, "prepared.onnx"), Path(folder, "int8.onnx")
@@ -75,11 +74,11 @@ def quantise(network: Path, frames: int) -> tuple[bytes, str]:
 
 
 def last_convolutions(model: onnx.ModelProto) -> list[str]:
-    """Names of the last convolutions before the outputs, and of the nodes between them and the outputs."""
-    maker = {output: node for node in model.graph.node for output in node.output}
+    """Returns the names of the last convolutions before the outputs, and of the nodes after them."""
+    producers = {output: node for node in model.graph.node for output in node.output}
     names, waiting = [], list(OUTPUTS)
     while waiting:
-        node = maker.get(waiting.pop())
+        node = producers.get(waiting.pop())
         if node is not None:
             names.append(node.name)
             if node.op_type != "Conv":
@@ -88,10 +87,12 @@ def last_convolutions(model: onnx.ModelProto) -> list[str]:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(prog="python -m birdslam.runtime.world.quantise", description="a network in int8")
+    parser = argparse.ArgumentParser(
+        prog="python -m birdslam.runtime.world.quantise", description="quantize a network to int8"
+    )
     parser.add_argument("network", type=Path)
     parser.add_argument("--frames", type=int, default=128)
-    parser.add_argument("--output", type=Path, help="folder; beside the network unless named")
+    parser.add_argument("--output", type=Path, help="output directory; default: that of the network")
     options = parser.parse_args(arguments)
     content, text = quantise(options.network, options.frames)
     write_network(options.output or options.network.parent, content, text, f"{options.network.stem}_int8")

@@ -1,9 +1,9 @@
-"""`make train`: the shipped network from a seed, on worlds that workers render; its curves are kept.
+"""`make train`: trains the shipped network from a seed, on rendered worlds. Needs the extra [train].
 
     python -m birdslam.runtime.world.train --output out/train [--config FILE.toml] [--start CHECKPOINT...]
 
-Needs the extra [train]. Everything of a run lies in its output: `curves.csv` and `.png`, `grades.csv` (on held-out
-worlds), `checkpoint.pt`, `multitask.onnx` with its manifest. A run that was cut off goes on with the same command.
+The output has `curves.csv` and `.png`, `grades.csv` (held-out worlds), `checkpoint.pt`, and `multitask.onnx` with its
+manifest. The same command continues an interrupted run.
 """
 
 from __future__ import annotations
@@ -33,22 +33,22 @@ from birdslam.world.training.validation import validate
 from birdslam.world.truth import WorldFrame
 
 NAME = "multitask"
-ABSREL_TO_SIGMA = (0.5 * np.pi) ** 0.5  # of a normal distribution: its sigma over its mean absolute error
+ABSREL_TO_SIGMA = (0.5 * np.pi) ** 0.5  # sigma over mean absolute error of a normal distribution
 
 
 class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A part of the training at one size."""
+    """A part of the training at one image size."""
 
     width_px: int
     height_px: int
-    batch: int  # of each process
+    batch: int  # per process
     steps: int
-    rate: float  # the learning rate at its start
-    looks: int  # at each rendered frame
+    rate: float  # initial learning rate
+    looks: int  # examples per rendered frame
 
 
 class TrainConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A whole training: small images first, where an hour shows four times as many, then the network's own size."""
+    """A training: small images first, which are four times as fast, then the image size of the network."""
 
     seed: int = 1
     stages: tuple[Stage, ...] = (
@@ -57,18 +57,18 @@ class TrainConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     )
     stream: StreamConfig = StreamConfig()
     trainer: TrainerConfig = TrainerConfig()
-    processes: int = 3  # learn side by side, each on batches of its own: better than threads of one
-    workers: int = 1  # of a process, which render; 0: it renders for itself
+    processes: int = 3  # data-parallel training processes
+    workers: int = 1  # rendering workers per process; 0: the process renders
     threads: int = 1
-    half: bool | None = None  # bfloat16; None: where the processor has it
+    half: bool | None = None  # bfloat16; None: if the processor supports it
     held_out_frames: int = 96
-    final_frames: int = 300  # held out, for the figures that the manifest states
-    row_steps: int = 50  # of curves.csv
+    final_frames: int = 300  # held-out frames for the metrics in the manifest
+    row_steps: int = 50  # between rows of curves.csv
     grade_steps: int = 1000
 
 
 class Worlds(IterableDataset[tuple[torch.Tensor, ...]]):
-    """The stream of examples, a part of its own for each worker."""
+    """The stream of examples, different for each worker."""
 
     def __init__(self, seed: tuple[int, ...], config: StreamConfig) -> None:
         self.seed, self.config = seed, config
@@ -82,12 +82,12 @@ class Worlds(IterableDataset[tuple[torch.Tensor, ...]]):
 
 
 def _render(seed: int, width_px: int, height_px: int) -> WorldFrame:
-    from birdslam.world.world import sample  # compiles its kernels: only where it is needed
+    from birdslam.world.world import sample  # imported late because it compiles kernels
 
     return sample(seed, width_px, height_px)
 
 
-def _share(parameters: Sequence[torch.nn.Parameter]) -> None:
+def _average_gradients(parameters: Sequence[torch.nn.Parameter]) -> None:
     """Replaces each gradient by its mean over all processes."""
     gradients = [p.grad for p in parameters if p.grad is not None]
     flat = torch.cat([gradient.reshape(-1) for gradient in gradients])
@@ -102,11 +102,11 @@ def _one_thread(_: int) -> None:
     cv2.setNumThreads(1)
 
 
-_WEIGHTS = "teacher"  # the key of the trainer's state in a checkpoint; it stays, so that older ones can be read
+_WEIGHTS = "teacher"  # key of the trainer state in a checkpoint; kept to read older checkpoints
 
 
 class Training:
-    """One run in one folder."""
+    """One training run with its output directory."""
 
     def __init__(self, config: TrainConfig, output: Path, start: Sequence[Path], rank: int) -> None:
         self.config, self.output, self.rank = config, output, rank
@@ -125,7 +125,7 @@ class Training:
             self.trainer.begin(*(torch.load(path, weights_only=True)[_WEIGHTS] for path in start))
 
     def run(self) -> None:
-        """The stages that are left, each from the step that is left."""
+        """Runs the remaining stages from the step of the checkpoint."""
         while self.stage < len(self.config.stages):
             self._learn(self.config.stages[self.stage], self.stage)
             if self.stage + 1 < len(self.config.stages):
@@ -135,7 +135,7 @@ class Training:
             self._save()
         if self.rank == 0:
             self._export(self._grade(self.config.stages[-1], self.stage, self.config.final_frames))
-            if (self.output / "curves.csv").exists():  # a mean of others has none
+            if (self.output / "curves.csv").exists():  # missing if no step was run
                 draw_curves(self.output)
 
     def _learn(self, stage: Stage, number: int) -> None:
@@ -158,13 +158,13 @@ class Training:
             asked_s = time.monotonic()
             batch = next(batches)
             waited_s += time.monotonic() - asked_s
-            share = _share if self.config.processes > 1 else None
+            share = _average_gradients if self.config.processes > 1 else None
             parts = self.trainer.train_step(batch, self.step / stage.steps, self.step, stage.rate, share)
             for name, value in parts.items():
                 sums[name] = sums.get(name, 0.0) + value / self.config.row_steps
             self.step += 1
             if self.rank > 0:
-                continue  # the first alone writes curves and checkpoints
+                continue  # only rank 0 writes curves and checkpoints
             if self.step % self.config.row_steps == 0:
                 spent_s = time.monotonic() - begun_s
                 row = {"stage": number, "step": self.step, "seconds": spent_s, "waited": waited_s, **sums}
@@ -178,7 +178,7 @@ class Training:
                 begun_s = time.monotonic()
 
     def _save(self) -> None:
-        """A checkpoint, whole or not at all."""
+        """Writes a checkpoint atomically."""
         if self.rank > 0:
             return
         state = {_WEIGHTS: self.trainer.state(), "stage": self.stage, "step": self.step}
@@ -187,7 +187,7 @@ class Training:
         partial.replace(self.output / "checkpoint.pt")
 
     def _grade(self, stage: Stage, number: int, frames: int) -> dict[str, float]:
-        """The figures of the average network on held-out worlds, and its thresholds; into grades.csv too."""
+        """Evaluates the averaged network on held-out worlds; returns metrics and thresholds, appends to grades.csv."""
         size_px = (stage.width_px, stage.height_px)
         rng = np.random.default_rng([self.config.seed, number])
         figures = validate(self.trainer.answer, _render, size_px, frames, self.config.stream.augmentation, rng)
@@ -196,7 +196,7 @@ class Training:
         return figures
 
     def _export(self, figures: Mapping[str, float]) -> None:
-        """The average network as ONNX with a manifest that states its figures, whole or not at all."""
+        """Writes the averaged network as ONNX with a manifest of its metrics, atomically."""
         network = self.trainer.average.module
         size_px = (self.config.stages[-1].width_px, self.config.stages[-1].height_px)
         content = to_onnx(network, *size_px)
@@ -231,7 +231,7 @@ def _append(path: Path, row: Mapping[str, Any]) -> None:
 
 
 def draw_curves(output: Path) -> None:
-    """curves.png: each part of the loss over the rows of curves.csv."""
+    """Draws curves.png: each part of the loss over the rows of curves.csv."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -254,7 +254,7 @@ def draw_curves(output: Path) -> None:
 
 
 def _learn(rank: int, config: TrainConfig, output: Path, start: Sequence[Path], meeting: str | None) -> None:
-    """One of the processes that learn side by side."""
+    """Runs one training process."""
     if meeting is not None:
         distributed.init_process_group("gloo", init_method=meeting, rank=rank, world_size=config.processes)
     Training(config, output, start, rank).run()
@@ -267,12 +267,12 @@ def main(arguments: list[str] | None = None) -> None:
         prog="python -m birdslam.runtime.world.train", description="train the shipped network"
     )
     parser.add_argument("--output", type=Path, default=Path("out/train"))
-    parser.add_argument("--config", type=Path, help="TOML with what differs from the defaults")
+    parser.add_argument("--config", type=Path, help="TOML file of differences from the defaults")
     parser.add_argument(
-        "--start", type=Path, nargs="+", default=[], help="checkpoints to begin from: the mean of their weights"
+        "--start", type=Path, nargs="+", default=[], help="start from the mean weights of these checkpoints"
     )
     options = parser.parse_args(arguments)
-    os.environ["NUMBA_NUM_THREADS"] = "1"  # the workers are the parallelism
+    os.environ["NUMBA_NUM_THREADS"] = "1"  # the workers run in parallel
     config = TrainConfig()
     if options.config is not None:
         config = msgspec.toml.decode(options.config.read_bytes(), type=TrainConfig)

@@ -1,6 +1,6 @@
 """`python -m birdslam.runtime.world.train_lanes`: trains the lane completion (ENet) on drives of the built-in world.
 
-The worlds' seeds, the shuffling and the first weights all come from one seed. Needs the extra [train].
+One seed determines worlds, shuffling and initial weights. Needs the extra [train].
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from birdslam.runtime.process.workers import workers
 from birdslam.world.training.lanes import ENet, LaneSamplesConfig, loss, samples
 
 DRIVE_FRAMES, RATE_HZ = 60, 10.0
-HELD_OUT = 10_000_000  # worlds from this seed on are never trained on
+HELD_OUT = 10_000_000  # first seed of the held-out worlds
 BATCH = 32
 LEARNING_RATE = 2e-3
 
 
 def drive_samples(seed: int) -> NDArray[np.uint8]:
-    """(N, 2, 2, rows, columns) of 0..255: gathered and true grids of one world's drive."""
+    """Returns observed and true grids of the drive in one world, (N, 2, 2, rows, columns) of 0..255."""
     from birdslam.world.world import World, WorldConfig
 
     torch.set_num_threads(1)
@@ -40,7 +40,7 @@ def drive_samples(seed: int) -> NDArray[np.uint8]:
 
 
 def drives(first_seed: int, count: int, processes: int) -> Iterator[NDArray[np.uint8]]:
-    """The samples of `count` worlds, in the order of their seeds."""
+    """Yields the samples of `count` worlds in the order of their seeds."""
     with workers(processes) as pool:
         yield from pool.map(drive_samples, range(first_seed, first_seed + count))
 
@@ -83,7 +83,7 @@ def main() -> int:
             order = rng.permutation(len(pairs))[: len(pairs) // BATCH * BATCH].reshape(-1, BATCH)
             for rows in order:
                 batch = pairs[np.sort(rows)]
-                if rng.random() < 0.5:  # left is as good as right
+                if rng.random() < 0.5:  # mirrored
                     batch = batch[..., ::-1]
                 value = loss(*_run(network, batch))
                 optimiser.zero_grad()
@@ -111,7 +111,7 @@ def _run(network: ENet, batch: NDArray[np.uint8]) -> tuple[torch.Tensor, torch.T
 
 
 def export(network: ENet, path: Path) -> None:
-    """The network with its sigmoid as ONNX, for one pair of grids."""
+    """Writes the network with its sigmoid as ONNX, for one pair of grids."""
     path.parent.mkdir(parents=True, exist_ok=True)
     whole = torch.nn.Sequential(network, torch.nn.Sigmoid()).eval()
     torch.onnx.export(

@@ -2,8 +2,8 @@
 
     python -m birdslam.runtime.world.train_pointnet --output out/train/pointnet [--ship]
 
-Worlds' seeds, noise, order and first weights come from one seed. Its curve and its network stay in the output. Needs
-the extra [train].
+One seed determines worlds, noise, order and initial weights. The output has the curve and the network. Needs the extra
+[train].
 """
 
 from __future__ import annotations
@@ -35,29 +35,29 @@ from birdslam.world.training.pointnet import (
 )
 
 NAME = "pointnet"
-MAP_PX = (320, 96)  # of the depth map that the shipped multi-task network gives
-FIRST_SEED = 2_000_000  # worlds with lower ones are for evaluation
+MAP_PX = (320, 96)  # size of the depth map of the shipped multi-task network
+FIRST_SEED = 2_000_000  # worlds with lower seeds are for evaluation
 HELD_OUT_SEED = 1_000
 BATCH = 128
 LEARNING_RATE = 2e-3
-FEW_POINTS = 192  # of each body, until the last two epochs: they teach nearly as much as all
-WORLDS_A_TASK = 100
+FEW_POINTS = 192  # per body until the last two epochs, for speed
+WORLDS_PER_TASK = 100
 
 
 def render(first_seed: int) -> list[FrustumExample]:
-    """The bodies of `WORLDS_A_TASK` independent frames."""
-    from birdslam.world.world import sample  # compiles its kernels: only where it is needed
+    """Returns the bodies of `WORLDS_PER_TASK` independent frames."""
+    from birdslam.world.world import sample  # imported late because it compiles kernels
 
     config = FrustumConfig()
-    frames = (sample(seed, *MAP_PX) for seed in range(first_seed, first_seed + WORLDS_A_TASK))
+    frames = (sample(seed, *MAP_PX) for seed in range(first_seed, first_seed + WORLDS_PER_TASK))
     return [example for frame in frames for example in frusta_of(frame, config)]
 
 
 def rendered(first_seed: int, frames: int, processes: int) -> list[FrustumExample]:
-    """The bodies of `frames` frames, in the order of their seeds."""
+    """Returns the bodies of `frames` frames in the order of their seeds."""
     out: list[FrustumExample] = []
     with workers(processes) as pool:
-        for part in pool.map(render, range(first_seed, first_seed + frames, WORLDS_A_TASK)):
+        for part in pool.map(render, range(first_seed, first_seed + frames, WORLDS_PER_TASK)):
             out += part
             print(f"\r{len(out)} bodies", end="", file=sys.stderr, flush=True)
     print(file=sys.stderr)
@@ -67,7 +67,7 @@ def rendered(first_seed: int, frames: int, processes: int) -> list[FrustumExampl
 def batches(
     examples: Sequence[FrustumExample], rng: np.random.Generator, points: int
 ) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
-    """Every example once, in an order of chance, each with errors and a choice of its points of its own; in batches."""
+    """Yields batches of all examples in random order, each with random depth errors and a random subset of points."""
     config, features, targets = DepthErrorConfig(), [], []
     for index in rng.permutation(len(examples)):
         one = training_pair(examples[index], config, rng)
@@ -82,7 +82,7 @@ def batches(
 def learn(
     examples: Sequence[FrustumExample], held_out: Sequence[FrustumExample], epochs: int, seed: int, curve: Path
 ) -> PointNet:
-    """A network taught on the examples; writes a row an epoch."""
+    """Trains a network on the examples; writes a row per epoch."""
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
     network = PointNet()
@@ -90,7 +90,7 @@ def learn(
     steps = epochs * (len(examples) // BATCH + 1)
     optimiser = torch.optim.AdamW(network.parameters(), LEARNING_RATE, weight_decay=1e-3)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, LEARNING_RATE, total_steps=steps, pct_start=0.1)
-    begun_s = time.monotonic()
+    start_s = time.monotonic()
     with curve.open("w", newline="") as file:
         rows = csv.writer(file)
         for epoch in range(epochs):
@@ -103,10 +103,10 @@ def learn(
                 torch.nn.utils.clip_grad_norm_(network.parameters(), 5.0)
                 optimiser.step()
                 schedule.step()
-            parts = graded(network, held_out)
+            parts = validated(network, held_out)
             if not epoch:
                 rows.writerow(["epoch", "seconds", *parts])
-            spent_s = time.monotonic() - begun_s
+            spent_s = time.monotonic() - start_s
             rows.writerow([epoch, f"{spent_s:.0f}", *(f"{value:.4f}" for value in parts.values())])
             file.flush()
             losses = "  ".join(f"{name} {value:.3f}" for name, value in parts.items())
@@ -114,8 +114,8 @@ def learn(
     return network
 
 
-def graded(network: PointNet, held_out: Sequence[FrustumExample]) -> dict[str, float]:
-    """Mean losses on bodies that it has not seen."""
+def validated(network: PointNet, held_out: Sequence[FrustumExample]) -> dict[str, float]:
+    """Returns the mean losses on held-out bodies."""
     network.eval()
     sums: dict[str, float] = {}
     count = 0
@@ -128,7 +128,7 @@ def graded(network: PointNet, held_out: Sequence[FrustumExample]) -> dict[str, f
 
 
 def write(network: PointNet, directory: Path) -> None:
-    """The network and its manifest."""
+    """Writes the network and its manifest."""
     content = to_onnx(network)
     (directory / f"{NAME}.onnx").write_bytes(content)
     parameters = sum(p.numel() for p in network.parameters())
@@ -139,7 +139,7 @@ def write(network: PointNet, directory: Path) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m birdslam.runtime.world.train_pointnet", description=__doc__)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--frames", type=int, default=8000, help="each of a world of its own")
+    parser.add_argument("--frames", type=int, default=8000, help="number of frames, each of another world")
     parser.add_argument("--epochs", type=int, default=16)
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--threads", type=int, default=2)
