@@ -1,15 +1,16 @@
 #!/bin/sh
-# Certificates for the gate: an authority of your own, the vehicle's certificate, one for each planner, and the car's.
-# And for a fleet, in a folder and of an authority of its own: the router's, one for each vehicle and each listener.
+# Creates the certificates of the gate: an authority, the vehicle, each planner and the car. Creates the certificates of
+# a fleet in another directory, with another authority: the router, each vehicle and each listener.
 #
 #   certificates.sh DIR vehicle ADDRESS...   ca.pem, vehicle.pem, vehicle.key; ADDRESS: names and IPs planners connect to
-#   certificates.sh DIR planner NAME         NAME.pem, NAME.key; NAME must stand in gate.json5 (cert_common_names)
-#   certificates.sh DIR car                  car.pem, car.key: of the computer that says how fast the car is
+#   certificates.sh DIR planner NAME         NAME.pem, NAME.key; add NAME to gate.json5 (cert_common_names)
+#   certificates.sh DIR car                  car.pem, car.key: the computer that publishes the speed of the car
 #   certificates.sh DIR router ADDRESS...    router.pem, router.key; ADDRESS: names and IPs that vehicles connect to
-#   certificates.sh DIR uplink NAME          NAME.vehicle.pem, NAME.vehicle.key: of the vehicle NAME of a fleet
-#   certificates.sh DIR planner NAME         also who listens to a fleet; NAME must stand in [router] (listeners)
+#   certificates.sh DIR uplink NAME          NAME.vehicle.pem, NAME.vehicle.key: the vehicle NAME of a fleet
+#   certificates.sh DIR planner NAME         a listener of a fleet; add NAME to [router] (listeners)
 #
-# What exists is kept: remove a file to make it anew. ca.key can sign whatever the vehicle believes: keep it elsewhere.
+# Existing files are kept; remove a file to create it again. Whoever has ca.key can sign certificates that the vehicle
+# accepts: keep it on another computer.
 set -eu
 umask 077
 days=${BIRDSLAM_CERTIFICATE_DAYS:-825}
@@ -19,7 +20,7 @@ fail() {
     exit 2
 }
 
-new_key() { # -newkey's arguments
+new_key() { # arguments of openssl req
     openssl req -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes "$@" 2>"$work/openssl" || fail "$(cat "$work/openssl")"
 }
 
@@ -35,14 +36,14 @@ certificate() { # FILE COMMON_NAME ALTERNATIVE_NAMES USAGE
         echo "$dir/$1.pem is kept"
         return 0
     fi
-    [ -e "$dir/ca.key" ] || fail "$dir/ca.key is not here: bring the authority's key to sign with"
+    [ -e "$dir/ca.key" ] || fail "$dir/ca.key is missing; copy the key of the authority here to sign"
     new_key -keyout "$work/$1.key" -out "$work/csr" -subj "/CN=$2"
     printf '%s\n' basicConstraints=critical,CA:FALSE keyUsage=critical,digitalSignature \
         "extendedKeyUsage=$4" "subjectAltName=$3" >"$work/extensions"
     openssl x509 -req -in "$work/csr" -CA "$dir/ca.pem" -CAkey "$dir/ca.key" -set_serial "0x$(openssl rand -hex 16)" \
         -days "$days" -extfile "$work/extensions" -out "$work/$1.pem" 2>"$work/openssl" || fail "$(cat "$work/openssl")"
     mv "$work/$1.key" "$work/$1.pem" "$dir"
-    echo "$dir/$1.pem and its key are made"
+    echo "created $dir/$1.pem and $dir/$1.key"
 }
 
 [ $# -ge 3 ] || [ "${2-}" = car ] ||
@@ -58,7 +59,7 @@ vehicle | router)
     names=
     for address in "$@"; do
         case $address in
-        *[!A-Za-z0-9.:-]*) fail "$address is no host name and no IP address" ;;
+        *[!A-Za-z0-9.:-]*) fail "$address is not a host name or an IP address" ;;
         *:*) kind=IP ;;
         *[!0-9.]*) kind=DNS ;;
         *) kind=IP ;;
@@ -70,28 +71,28 @@ vehicle | router)
     ;;
 planner)
     case $1 in
-    *[!A-Za-z0-9_-]* | ca | vehicle | router | car) fail "a planner's name has letters, digits, '_' and '-', and is not $1" ;;
+    *[!A-Za-z0-9_-]* | ca | vehicle | router | car) fail "$1: the name of a planner has letters, digits, '_' and '-', and is not ca, vehicle, router or car" ;;
     esac
     authority
     certificate "$1" "$1" "DNS:$1" clientAuth
     ;;
 uplink)
     case $1 in
-    *[!A-Za-z0-9_-]* | [_-]* | "") fail "a vehicle's name has letters, digits, '_' and '-', and is not $1" ;;
+    *[!A-Za-z0-9_-]* | [_-]* | "") fail "$1: the name of a vehicle has letters, digits, '_' and '-', and starts with a letter or a digit" ;;
     esac
-    [ ${#1} -le 32 ] || fail "a vehicle's name has 32 characters at most, and is not $1"
+    [ ${#1} -le 32 ] || fail "$1: the name of a vehicle has at most 32 characters"
     authority
-    certificate "$1.vehicle" "vehicle $1" "DNS:$1" clientAuth # no planner's name may have a blank in it
+    certificate "$1.vehicle" "vehicle $1" "DNS:$1" clientAuth # the blank distinguishes it from planners
     ;;
 car)
     authority
-    certificate car "the car" "DNS:car" clientAuth # a name that no planner's certificate has
+    certificate car "the car" "DNS:car" clientAuth # the blank distinguishes it from planners
     ;;
 *) fail "$what: expected vehicle, planner, car, router or uplink" ;;
 esac
 
 chmod 644 "$dir"/*.pem
-# The service's user reads the key of the vehicle's gate or of the router, and no other.
+# The user of the service can read only the key of the gate or the router.
 for key in vehicle.key router.key; do
     if [ "$(id -u)" = 0 ] && getent group birdslam >/dev/null && [ -e "$dir/$key" ]; then
         chgrp birdslam "$dir" "$dir/$key"

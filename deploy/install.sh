@@ -1,11 +1,12 @@
 #!/bin/sh
-# Installs BirdSLAM as a service of systemd, or brings an installation up to date; the configuration is never touched.
+# Installs or upgrades BirdSLAM as a systemd service; keeps the configuration.
 #
 #   sudo deploy/install.sh                       install or upgrade, from this checkout or folder of `birdslam deploy`
 #   sudo deploy/install.sh uninstall [--purge]   remove it; --purge: configuration, certificates, results and user too
 #
-# PYTHON (default /usr/bin/python3, 3.11 or newer) makes the virtual environment; BIRDSLAM_PACKAGE, a wheel, takes the
-# place of the checkout, or of what pip finds by the name that `birdslam deploy` wrote down. pip's own variables (PIP_INDEX_URL, PIP_FIND_LINKS, ...) hold. Run it as often as you like.
+# PYTHON (default /usr/bin/python3, 3.11 or newer) creates the virtual environment. BIRDSLAM_PACKAGE, a wheel or a
+# requirement for pip, replaces the checkout or the package that `birdslam deploy` pinned. The variables of pip
+# (PIP_INDEX_URL, PIP_FIND_LINKS, ...) apply. The script can run repeatedly.
 set -eu
 
 prefix=/opt/birdslam
@@ -27,15 +28,15 @@ systemd_runs() { [ -d /run/systemd/system ]; }
 check() {
     command -v systemd-sysusers >/dev/null || fail "systemd is missing: apt-get install systemd"
     "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null ||
-        fail "$python is no Python 3.11 or newer; set PYTHON=..."
+        fail "$python is not Python 3.11 or newer; set PYTHON=..."
     "$python" -c 'import ensurepip' 2>/dev/null || fail "$python has no venv module: apt-get install python3-venv"
     path=$("$python" -c 'import os, sys; print(os.path.realpath(sys.executable).lstrip("/"))')
     case ${path%%/*} in
-    home | root) fail "$python lies in a home directory, which the service can't see; set PYTHON=..." ;;
+    home | root) fail "$python is in a home directory, which the service can't access; set PYTHON=..." ;;
     esac
 }
 
-# A release is a directory of its own and `current` points to one: an upgrade that fails changes nothing.
+# Each release is a directory and `current` points to one, so that a failed upgrade changes nothing.
 new_release() {
     mkdir -p "$prefix/releases"
     chmod 755 "$prefix" "$prefix/releases"
@@ -47,7 +48,7 @@ new_release() {
         package=$BIRDSLAM_PACKAGE
     elif [ -f "$source/package" ]; then
         package=$(cat "$source/package")
-    else # built from a copy: nothing of root's is left in the checkout
+    else # built from a copy, to leave no files of root in the checkout
         package=$release/source
         mkdir "$package"
         (cd "$source" && cp -R pyproject.toml setup.py README.md LICENSE birdslam runtime deploy configs "$package")
@@ -55,31 +56,31 @@ new_release() {
     "$release/bin/python" -m pip install --quiet --disable-pip-version-check "$package"
     rm -rf "$release/source"
     "$release/bin/birdslam" --version
-    cp -R "$source/deploy" "$release/deploy" # certificates.sh, and this script to uninstall with
+    cp -R "$source/deploy" "$release/deploy" # certificates.sh, and this script for uninstall
     trap - EXIT
     previous=$(readlink "$prefix/current" || true)
     ln -s "$release" "$prefix/current.new"
     mv -T "$prefix/current.new" "$prefix/current"
-    for old in "$prefix"/releases/*; do # one release stays to go back to
+    for old in "$prefix"/releases/*; do # keep one release for a rollback
         [ "$old" = "$release" ] || [ "$old" = "$previous" ] || rm -rf "$old"
     done
 }
 
-keep_or_copy() { # FILE TARGET: a file of the user's stays as it is; ours lies beside it, where it differs
+keep_or_copy() { # FILE TARGET: keeps an existing target and writes a different version to TARGET.new
     if [ ! -e "$2" ]; then
         install -m 644 "$1" "$2"
     elif cmp -s "$1" "$2"; then
         rm -f "$2.new"
     else
         install -m 644 "$1" "$2.new"
-        say "$2 is kept; this version's own is $2.new"
+        say "$2 is kept; the version of this release is $2.new"
     fi
 }
 
 configuration() {
     install -d -m 755 "$etc"
     template=$(mktemp)
-    grep -v '^output = ' "$source/configs/vehicle.toml" >"$template" # the unit says where results go
+    grep -v '^output = ' "$source/configs/vehicle.toml" >"$template" # the unit sets the output directory
     keep_or_copy "$template" "$etc/vehicle.toml"
     rm -f "$template"
     keep_or_copy "$source/deploy/gate.json5" "$etc/gate.json5"
@@ -101,7 +102,7 @@ install_or_upgrade() {
             systemctl try-restart "$unit"
         done
     else
-        say "systemd does not run here: the service is not enabled"
+        say "systemd is not running: the service is not enabled"
     fi
     say "installed in $prefix; configure $etc/vehicle.toml, then: systemctl start birdslam"
 }

@@ -241,7 +241,7 @@ def test_the_files_are_valid_and_hold_the_way(tmp_path: Path) -> None:
     assert track.name == "ego & <more>"
     assert [(p.latitude, p.longitude) for p in track.segments[0].points] == [tuple(row) for row in degrees]
     assert "-114.30000000,51.20000000" in (tmp_path / "way.kml").read_text()
-    with pytest.raises(ValueError, match="is written as"):
+    with pytest.raises(ValueError, match="expected a suffix of"):
         write_geo_lines(tmp_path / "way.shp", [way])
 
 

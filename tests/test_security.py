@@ -525,7 +525,7 @@ def test_certificates_are_kept_and_made_only_by_the_authority(certificates: Path
         ("vehicle.key", "missing.key", "missing.key"),
         ('link_protocols: ["tls"], cert_common_names: ["planner"]', 'link_protocols: ["tls"]', "certificate"),
         ('"declare_subscriber", "query"', '"declare_subscriber", "put", "query"', "allows put"),
-        ('cert_common_names: ["the car"]', 'cert_common_names: ["planner"]', "'what the car says' allows put"),
+        ('cert_common_names: ["the car"]', 'cert_common_names: ["planner"]', "'car sends speed' allows put"),
         ('cert_common_names: ["the car"]', 'cert_common_names: ["the car", "planner"]', "allows put"),
         ('subjects: ["the car"]', 'subjects: ["the car", "planners"]', "allows put"),
         (
