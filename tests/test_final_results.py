@@ -291,7 +291,11 @@ def test_a_video_that_cannot_be_is_named_before_anything_starts(
 ) -> None:
     (tmp_path / "is.mp4").mkdir()
     (tmp_path / "file").touch()
-    for name, reason in (("file/v.mp4", "can't be created"), ("v.gif", "expected FILE.mp4"), ("is.mp4", "is a directory")):
+    for name, reason in (
+        ("file/v.mp4", "can't be created"),
+        ("v.gif", "expected FILE.mp4"),
+        ("is.mp4", "is a directory"),
+    ):
         output = str(tmp_path / "out")
         assert main(["run", "--source", "demo", "--video", str(tmp_path / name), "--output", output]) == 2
         error = capsys.readouterr().err
