@@ -42,7 +42,7 @@ def car(vehicle: int, pose: SE2, age_ns: int = 0) -> VehicleEstimate:
     )
 
 
-def test_a_drive_comes_back_as_it_was_estimated() -> None:
+def test_the_atlas_returns_the_estimates() -> None:
     graph, atlas, estimates = PoseGraph(GraphConfig(), WeightsConfig()), Atlas(AtlasConfig()), {}
     for m in drive(DriveConfig(frames=300, vehicles=4), seed=3).measurements:
         estimate = estimates[m.frame_id] = graph.optimise(m)
@@ -91,7 +91,7 @@ def test_key_poses_lie_apart_and_the_newest_is_always_there() -> None:
     assert [pose.frame_id for pose in way.ego] == [0, 2, 4, 6, 8, 10]
 
 
-def test_a_standing_car_leaves_one_pose_however_long_it_stands() -> None:
+def test_a_stationary_car_has_one_pose() -> None:
     atlas = Atlas(SMALL)
     for frame in range(500):
         atlas.add(at(frame, SE2(1.0, 2.0, 0.3)))
@@ -100,7 +100,7 @@ def test_a_standing_car_leaves_one_pose_however_long_it_stands() -> None:
     assert [pose.frame_id for pose in way.ego] == [0, 499]
 
 
-def test_of_an_endless_drive_the_past_is_coarse_and_the_memory_bounded() -> None:
+def test_memory_is_bounded_by_a_coarse_past() -> None:
     atlas = Atlas(SMALL)
     for frame in range(4000):
         atlas.add(at(frame, SE2(0.5 * frame)), MapUpdate(epoch=0, frame_id=frame, lanes_m=((0.5 * frame, 1.75),)))

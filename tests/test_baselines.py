@@ -65,7 +65,7 @@ def test_a_world_without_noise_is_recovered(world: Drive, method) -> None:  # ty
     assert car_m < 0.05
 
 
-def test_the_batch_finds_the_scale_by_itself(world: Drive) -> None:
+def test_the_batch_estimates_the_scale(world: Drive) -> None:
     """Whatever unit the odometry has, the answer is in metres."""
     factor = 0.25
     scaled = [
@@ -105,7 +105,7 @@ def test_a_batch_stopped_at_its_cap_gets_no_ratio(monkeypatch: pytest.MonkeyPatc
     assert rows["batch SE(3), metric odometry"]["ratio"] > 0.0
 
 
-def test_a_place_that_the_log_does_not_know_is_none_in_the_batch(world: Drive) -> None:
+def test_an_unknown_position_is_missing_in_the_batch(world: Drive) -> None:
     """A box cut to a sliver stands anywhere, and the paper's weights can't say so."""
     log = list(world.measurements)
     first, *others = log[20].cv
@@ -131,7 +131,7 @@ def test_lanes_can_be_left_out(world: Drive) -> None:
     assert batch_se3.run(lying, CAMERA, lanes=False) == batch_se3.run(without, CAMERA)
 
 
-def test_lanes_hold_an_odometry_that_slides() -> None:
+def test_lanes_correct_lateral_odometry_drift() -> None:
     """Exact landmarks take back most of what an odometry adds sideways; without them it stays."""
     world = drive(msgspec.structs.replace(QUIET, vehicles=1), seed=4)
     sliding = [
@@ -158,7 +158,7 @@ def test_cuboids_are_recovered_from_boxes_of_known_size(world: Drive) -> None:
     assert car_m < 2.5  # a car that changes lanes without turning its nose is not in its motion model
 
 
-def test_namdev_finds_the_scale_of_a_car_that_stands() -> None:
+def test_namdev_estimates_the_scale_from_a_stationary_car() -> None:
     """The ego speeds up: only one scale leaves the car where it is, whatever the prior on its size."""
     steps = [SE2(0.5 + 0.03 * k, 0.0, 0.02 * math.sin(0.3 * k)) for k in range(40)]
     ego, place, log = SE2(), SE2(45.0, 4.0), []
@@ -175,7 +175,7 @@ def test_namdev_finds_the_scale_of_a_car_that_stands() -> None:
     assert max(math.hypot(p.x_m - place.x_m, p.y_m - place.y_m) for p in poses.values()) < 0.5
 
 
-def test_an_empty_log_gives_nothing() -> None:
+def test_an_empty_log_gives_an_empty_result() -> None:
     for method in (nair, batch_se3, namdev, cubeslam):
         assert method.run([], CAMERA) == Trajectories()
         assert method.label
@@ -202,7 +202,7 @@ def test_a_new_epoch_goes_on_where_the_last_one_ended() -> None:
     assert [live.result.ego[k].x_m for k in range(4)] == [0.0, 2.0, 2.0, 3.5]
 
 
-def test_dead_reckoning_is_the_chain(world: Drive) -> None:
+def test_dead_reckoning_chains_the_odometry(world: Drive) -> None:
     ego_m, car_m = worst_m(world, dead_reckoned(world.measurements))
     assert ego_m < 1e-6
     assert car_m < 1e-6

@@ -52,7 +52,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
-def test_every_kind_of_drive_is_known_by_what_lies_there(tmp_path: Path) -> None:
+def test_every_kind_of_drive_is_recognised_by_its_files(tmp_path: Path) -> None:
     kitti(tmp_path / "sequences" / "00", 1)
     kitti(tmp_path / "sequences" / "01", 1)
     (tmp_path / "bag").mkdir()
@@ -82,7 +82,7 @@ def test_every_kind_of_drive_is_known_by_what_lies_there(tmp_path: Path) -> None
         (["list.txt"], "line 1: No closing quotation"),
     ],
 )
-def test_a_list_that_is_none_is_named(
+def test_an_invalid_list_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], said: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -106,7 +106,7 @@ def test_a_sweep_is_every_combination_and_each_has_a_folder(tmp_path: Path) -> N
         made([drive], ("slam.nothing=1",))
 
 
-def test_a_worker_that_stands_elsewhere_finds_every_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_paths_are_independent_of_the_working_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     kitti(tmp_path / "00", 1)
     (tmp_path / "speed.txt").write_text("0 1\n")
     (tmp_path / "net.onnx").touch()
@@ -148,7 +148,7 @@ def test_results_appear_whole_and_are_the_same_bytes(tmp_path: Path, monkeypatch
         done(tmp_path / "once", msgspec.structs.replace(task, identity="0"))
 
 
-def test_the_first_frames_of_a_drive_are_held_to_their_truth(tmp_path: Path) -> None:
+def test_the_first_frames_of_a_drive_are_compared_with_the_truth(tmp_path: Path) -> None:
     drive = kitti(tmp_path / "sequences" / "00", frames=6, truth=True)
     (task,) = tasks(find_drives([str(drive)]), sweep([]), None, {**PLAIN, "source.frames": 4}, [], {})
     told = []
@@ -160,7 +160,7 @@ def test_the_first_frames_of_a_drive_are_held_to_their_truth(tmp_path: Path) -> 
     assert result.truth.ate_m is not None
 
 
-def test_a_drive_that_fails_leaves_nothing(tmp_path: Path) -> None:
+def test_a_failed_drive_leaves_no_files(tmp_path: Path) -> None:
     (task,) = made([kitti(tmp_path / "00")])
 
     def full(*at: int) -> None:
@@ -208,9 +208,7 @@ def test_the_report_lists_every_drive(tmp_path: Path, count: int) -> None:
 
 
 @pytest.mark.processes
-def test_one_drive_ends_no_other_and_failed_ones_are_tried_again(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_failed_drive_is_isolated_and_retried(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     good, broken = kitti(tmp_path / "sequences" / "00", truth=True), kitti(tmp_path / "sequences" / "01")
     calibration = (broken / "calib.txt").read_text()
     (broken / "calib.txt").unlink()

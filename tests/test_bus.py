@@ -71,7 +71,7 @@ def until(condition: Any, what: str) -> None:
         time.sleep(0.005)
 
 
-def test_records_go_round_with_their_traces(join: Any) -> None:
+def test_records_arrive_with_their_traces(join: Any) -> None:
     join("supervisor", hub=True)
     capture, perceive = join("capture"), join("perceive")
     frames, out = perceive.subscriber("frame"), capture.publisher("frame")
@@ -109,7 +109,7 @@ def test_topics_of_one_sender_keep_their_order(join: Any) -> None:
         assert there_already.record.frame_id == frame_id
 
 
-def test_of_a_hot_topic_the_newest_wins(join: Any) -> None:
+def test_a_hot_topic_delivers_the_newest_message(join: Any) -> None:
     hub = join("supervisor", hub=True)
     frames = hub.subscriber("frame")
     out = join("capture", lossless=True).publisher("frame")  # so that zenoh itself drops none of them
@@ -122,7 +122,7 @@ def test_of_a_hot_topic_the_newest_wins(join: Any) -> None:
     assert frames.dropped == 9
 
 
-def test_a_bounded_queue_keeps_the_last_and_counts_the_rest(join: Any) -> None:
+def test_a_bounded_queue_keeps_the_last_and_counts_drops(join: Any) -> None:
     hub = join("supervisor", hub=True)
     queue, short = hub.subscriber("measurements"), hub.subscriber("measurements", depth=2)
     out = join("perceive", lossless=True).publisher("measurements")
@@ -136,7 +136,7 @@ def test_a_bounded_queue_keeps_the_last_and_counts_the_rest(join: Any) -> None:
     assert (queue.dropped, short.dropped) == (12, 18)
 
 
-def test_messages_that_wait_behind_many_are_kept_as_bytes_and_come_out_the_same(join: Any) -> None:
+def test_queued_messages_are_kept_as_bytes(join: Any) -> None:
     hub = join("supervisor", hub=True)
     queue = hub.subscriber("measurements", depth=64)
     out = join("perceive", lossless=True).publisher("measurements")
@@ -152,7 +152,7 @@ def test_messages_that_wait_behind_many_are_kept_as_bytes_and_come_out_the_same(
     assert queue.dropped == 0
 
 
-def test_malformed_messages_are_counted_and_survived(join: Any, base: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_malformed_messages_are_counted(join: Any, base: Path, caplog: pytest.LogCaptureFixture) -> None:
     hub = join("supervisor", hub=True)
     estimates = hub.subscriber("estimate", depth=16)
     out = join("optimize", lossless=True).publisher("estimate")
@@ -186,7 +186,7 @@ def test_malformed_messages_are_counted_and_survived(join: Any, base: Path, capl
     assert sum("malformed" in record.message for record in caplog.records) == 1
 
 
-def test_messages_that_were_lost_on_the_way_are_counted(join: Any, base: Path) -> None:
+def test_lost_messages_are_counted(join: Any, base: Path) -> None:
     hub = join("supervisor", hub=True)
     estimates = hub.subscriber("estimate", depth=16)
     out = join("optimize", lossless=True).publisher("estimate")
@@ -206,7 +206,7 @@ def test_messages_that_were_lost_on_the_way_are_counted(join: Any, base: Path) -
     assert estimates.dropped == 3
 
 
-def test_a_message_that_comes_twice_is_received_once(join: Any, base: Path) -> None:
+def test_a_duplicate_message_is_received_once(join: Any, base: Path) -> None:
     """Who comes late asks for the last one, and gets it a second time where it was just being sent."""
     estimates = join("supervisor", hub=True).subscriber("estimate", depth=16)
     with foreign_session(base) as foreign:
@@ -289,7 +289,7 @@ def test_a_matching_wait_ends_in_time_and_when_somebody_comes(join: Any) -> None
     until(lambda: not out.matched, "nobody is left")
 
 
-def test_liveliness_comes_and_goes(join: Any, base: Path) -> None:
+def test_liveliness_follows_the_node(join: Any, base: Path) -> None:
     hub = join("supervisor", hub=True)
     seen: list[tuple[str, bool]] = []
     hub.on_alive(lambda node, alive: seen.append((node, alive)))
@@ -327,7 +327,7 @@ def test_vehicles_do_not_receive_each_others_messages(base: Path) -> None:
         assert wrong.recv(0.1) is None
 
 
-def test_close_wakes_everybody_and_leaves_nothing(base: Path) -> None:
+def test_close_wakes_all_waiting_threads(base: Path) -> None:
     hub = Bus("car", "supervisor", hub=True, runtime_dir=base)
     node = Bus("car", "capture", runtime_dir=base)
     frames, out = hub.subscriber("frame"), node.publisher("frame")
@@ -457,7 +457,7 @@ def test_a_killed_sender_is_noticed_and_its_successor_is_received(join: Any, spa
         until(lambda: not hub.alive and not planner.alive, "it is seen to be dead")
 
 
-def test_a_killed_hub_comes_back_and_finds_everybody(join: Any, spawn: Any, base: Path) -> None:
+def test_a_restarted_hub_reconnects_to_all_nodes(join: Any, spawn: Any, base: Path) -> None:
     first = spawn(HUB)
     capture, perceive = join("capture"), join("perceive")
     frames, out = perceive.subscriber("frame"), capture.publisher("frame")
@@ -474,7 +474,7 @@ def test_a_killed_hub_comes_back_and_finds_everybody(join: Any, spawn: Any, base
     until(lambda: out.put(frame_ref(2)) or late_frames.recv(0.1), "the latecomer hears capture")
 
 
-def test_a_planner_lives_through_everything(base: Path, spawn: Any) -> None:
+def test_a_planner_survives_restarts(base: Path, spawn: Any) -> None:
     with Planner("car", base) as planner:
         nothing = planner.latest()
         assert nothing == Reading(None, alive=False, on_time=False, valid=False, age_ms=float("inf"))
@@ -500,7 +500,7 @@ def test_a_planner_lives_through_everything(base: Path, spawn: Any) -> None:
         kill(hub)
 
 
-def test_alive_on_time_and_valid_are_three_things(join: Any, base: Path) -> None:
+def test_alive_on_time_and_valid_are_independent(join: Any, base: Path) -> None:
     join("supervisor", hub=True)
     optimize = join("optimize")
     out = optimize.publisher("estimate")
@@ -556,7 +556,7 @@ def test_a_planner_iterates_until_it_is_closed(join: Any, base: Path) -> None:
         planner.wait(0.0)
 
 
-def test_a_second_instance_is_refused_until_the_first_is_dead(base: Path, spawn: Any) -> None:
+def test_a_second_instance_is_rejected_while_the_first_runs(base: Path, spawn: Any) -> None:
     first = spawn(HUB)
     with pytest.raises(VehicleBusy, match=f"'car' already runs: process {first.pid}, lock file .*/car/lock"):
         VehicleLock("car", base)
@@ -586,7 +586,7 @@ def test_a_node_that_runs_already_is_named(join: Any, base: Path) -> None:
         Bus("car", "capture", runtime_dir=base)
 
 
-def test_bad_names_and_directories_are_named(base: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invalid_names_and_directories_are_named(base: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ValueError, match="vehicle 'a/b'"):
         Bus("a/b", "capture", runtime_dir=base)
     with pytest.raises(ValueError, match="node 'x\\*'"):

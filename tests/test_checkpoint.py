@@ -55,7 +55,7 @@ def worn(log: list[Measurements], break_at: int, blind_at: int) -> list[Measurem
     mode=st.sampled_from(sorted(SETTINGS)),
     taken=st.booleans(),
 )
-def test_a_restored_graph_goes_on_with_the_same_bytes(
+def test_a_restored_graph_continues_bit_for_bit(
     world: list[Measurements], cut: int, break_at: int, blind_at: int, mode: str, taken: bool
 ) -> None:
     log = worn(world, break_at, blind_at)
@@ -71,7 +71,7 @@ def test_a_restored_graph_goes_on_with_the_same_bytes(
     assert goes_on(restored, log[cut:]) == goes_on(graph, log[cut:])
 
 
-def test_a_checkpoint_does_not_change_with_the_graph_it_was_taken_of() -> None:
+def test_a_checkpoint_is_independent_of_its_graph() -> None:
     graph = PoseGraph(*SETTINGS["measured"])
     for m in WORLDS[0][:50]:
         graph.optimise(m)
@@ -80,7 +80,7 @@ def test_a_checkpoint_does_not_change_with_the_graph_it_was_taken_of() -> None:
     assert goes_on(PoseGraph.restore(data, *SETTINGS["measured"]), WORLDS[0][50:]) == first
 
 
-def test_it_can_be_taken_after_an_edge_from_an_older_frame() -> None:
+def test_a_checkpoint_after_an_edge_from_an_older_frame() -> None:
     graph, log = PoseGraph(*SETTINGS["measured"]), list(WORLDS[0][:10])
     before, last = log[-2].cc, log[-1].cc
     assert before is not None
@@ -106,7 +106,7 @@ def checkpoint() -> bytes:
 
 
 @given(where=st.integers(0, 10**6), bit=st.integers(0, 7))
-def test_a_flipped_bit_is_found(where: int, bit: int) -> None:
+def test_a_flipped_bit_is_detected(where: int, bit: int) -> None:
     torn = bytearray(checkpoint())
     torn[where % len(torn)] ^= 1 << bit
     with pytest.raises(CheckpointError, match=r"torn|no checkpoint|version"):
@@ -114,14 +114,14 @@ def test_a_flipped_bit_is_found(where: int, bit: int) -> None:
 
 
 @given(length=st.integers(0, 10**6))
-def test_a_cut_is_found(length: int) -> None:
+def test_a_truncated_checkpoint_is_detected(length: int) -> None:
     data = checkpoint()
     with pytest.raises(CheckpointError, match=r"torn|no checkpoint|version"):
         PoseGraph.restore(data[: length % len(data)], *SETTINGS["measured"])
 
 
 @pytest.mark.parametrize("data", [b"", b"\x00" * 100, msgspec.msgpack.encode({"epoch": 1})])
-def test_other_bytes_are_refused(data: bytes) -> None:
+def test_foreign_bytes_are_rejected(data: bytes) -> None:
     with pytest.raises(CheckpointError, match="no checkpoint of a pose graph"):
         PoseGraph.restore(data, *SETTINGS["measured"])
 
@@ -134,7 +134,7 @@ def test_other_settings_are_named() -> None:
         PoseGraph.restore(data, GraphConfig(), WeightsConfig(mode="paper"))
 
 
-def test_parts_that_do_not_belong_together_are_refused() -> None:
+def test_inconsistent_parts_are_rejected() -> None:
     """Whole by its sum, but not what this code writes."""
     whole = unpack(checkpoint(), PoseGraph(*SETTINGS["measured"]).settings)
     begun = whole.started

@@ -24,14 +24,14 @@ def configuration(*arguments: str):  # type: ignore[no-untyped-def]
     return configuration_of(parse(arguments))
 
 
-def test_no_map_takes_away_the_map_of_the_configuration_file(tmp_path: Path) -> None:
+def test_no_map_overrides_the_map_of_the_configuration_file(tmp_path: Path) -> None:
     (tmp_path / "car.toml").write_text('[results]\nmap = "road.map"\n')
     arguments = ["run", str(tmp_path / "car.toml"), "--source", "v4l2:/dev/video0"]
     assert configuration(*arguments).maps_live
     assert not configuration(*arguments, "--no-map").maps_live
 
 
-def test_the_version(capsys: pytest.CaptureFixture[str]) -> None:
+def test_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as end:
         main(["--version"])
     assert end.value.code == 0
@@ -39,7 +39,7 @@ def test_the_version(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.words)
-def test_each_command_of_the_table_is_there(command: Command, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_command_of_the_table_exists(command: Command, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as end:
         main([*command.words.split(), "--help"])
     assert end.value.code == 0
@@ -47,7 +47,7 @@ def test_each_command_of_the_table_is_there(command: Command, capsys: pytest.Cap
 
 
 @pytest.mark.processes
-def test_the_help_is_light(tmp_path: Path) -> None:
+def test_help_imports_no_heavy_library(tmp_path: Path) -> None:
     """It loads none of the libraries that the commands compute with."""
     code = "import sys; from birdslam.runtime.cli.commands import parse\ntry: parse(['--help'])\n"
     code += "except SystemExit: assert not {'numpy', 'cv2', 'zenoh', 'msgspec'} & set(sys.modules)"
@@ -62,7 +62,7 @@ def test_a_wrong_command_shows_the_usage(arguments: list[str], capsys: pytest.Ca
     assert "usage: birdslam" in capsys.readouterr().err
 
 
-def test_options_go_over_the_file(tmp_path: Path) -> None:
+def test_options_override_the_file(tmp_path: Path) -> None:
     path = tmp_path / "a.toml"
     path.write_text(
         'vehicle = "van"\noutput = "there"\n[source]\nrate = 3\n[models.detector]\npath = "old.onnx"\nevery = 2\n'
@@ -83,7 +83,7 @@ def test_options_go_over_the_file(tmp_path: Path) -> None:
     assert configuration("evaluate", "odometry", "00", "--config", str(path)).vehicle == "van"
 
 
-def test_no_model_is_a_choice() -> None:
+def test_model_none_disables_the_shipped_network() -> None:
     assert configuration("run", "--model", "none").models.in_use() == {}
     one = configuration("run", "--model", "none", "--model", "detector=a.onnx").models
     assert one.in_use() == {"detector": ModelSpec("a.onnx")}
@@ -115,7 +115,7 @@ def test_a_model_needs_a_role() -> None:
         (["listen", "--vehicle", "a/b"], "vehicle"),
     ],
 )
-def test_a_mistake_is_one_line(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_user_error_is_one_line(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(arguments) == 2
     out, err = capsys.readouterr()
     assert err.count("\n") == 1
@@ -130,7 +130,7 @@ def test_listen_without_a_vehicle_ends_on_a_signal(tmp_path: Path, capsys: pytes
 
 
 @pytest.mark.parametrize(("text", "complaint"), [("14", "FIRST:END"), ("a:", "FIRST:END"), ("999:", "fewer than two")])
-def test_frames_that_cannot_be_compared_are_one_line(
+def test_invalid_frames_to_compare_are_a_one_line_error(
     text: str, complaint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arguments = ["evaluate", "odometry", "demo", "--model", "none", "--frames", text, "--output", str(tmp_path)]
@@ -146,7 +146,7 @@ def test_frames_that_cannot_be_compared_are_one_line(
         (("--source", "video:FILM", "--height", "1.4", "--fov", "3"), "--fov 3: expected a field of view"),
     ],
 )
-def test_a_first_pass_that_can_not_be_is_refused(
+def test_an_impossible_first_pass_is_rejected(
     options: tuple[str, ...], reason: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     camera, film = tmp_path / "camera.toml", tmp_path / "film.avi"
@@ -203,7 +203,7 @@ def test_a_path_is_a_source_of_its_kind(
         (["run", "a.toml", "b.toml"], "b.toml: there is a configuration file already, a.toml"),
     ],
 )
-def test_a_path_that_is_no_source_is_refused(
+def test_an_unknown_path_is_rejected(
     arguments: list[str],
     message: str,
     tmp_path: Path,

@@ -27,7 +27,7 @@ def write(path: Path, text: str) -> Path:
     return path
 
 
-def test_nothing_gives_the_defaults() -> None:
+def test_an_empty_file_gives_the_defaults() -> None:
     assert load(None) == Configuration()
 
 
@@ -67,7 +67,7 @@ def test_a_wrong_key_names_the_file_and_the_key(tmp_path: Path, text: str, key: 
     assert reason in message
 
 
-def test_no_file_and_no_toml(tmp_path: Path) -> None:
+def test_a_missing_or_invalid_file_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match=r"missing\.toml: No such file"):
         load(tmp_path / "missing.toml")
     with pytest.raises(ConfigurationError, match=r"a\.toml: not TOML: .*line 1"):
@@ -93,7 +93,7 @@ def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:
     }
 
 
-def test_the_shipped_network_fills_what_is_left() -> None:
+def test_the_shipped_network_takes_the_missing_roles() -> None:
     own = ModelSpec("own.onnx")
     assert list(load(None).models.in_use()) == ["multitask"]
     assert Path(load(None).models.in_use()["multitask"].path).is_file()
@@ -125,13 +125,13 @@ def test_a_camera_file_can_be_pinned(tmp_path: Path) -> None:
         load(None, {"camera": str(tmp_path / "none.toml"), "camera_sha256": pin})
 
 
-def test_a_camera_file_that_is_wrong_is_named(tmp_path: Path) -> None:
+def test_an_invalid_camera_file_is_named(tmp_path: Path) -> None:
     path = write(tmp_path / "front.toml", CAMERA + "zoom = 3\n")
     with pytest.raises(ConfigurationError, match=r"camera file .*front\.toml: .*zoom"):
         load(None, {"camera": str(path)})
 
 
-def test_overrides_go_over_the_file_and_are_named(tmp_path: Path) -> None:
+def test_overrides_replace_the_file_and_are_named(tmp_path: Path) -> None:
     path = write(tmp_path / "a.toml", "[source]\nrate = 10\nstride = 2\n[models.detector]\nevery = 3\n")
     configuration = load(path, {"source.rate": "max", "models.detector.path": "net.onnx"})
     assert configuration.lossless
@@ -166,7 +166,7 @@ def test_a_setting_needs_a_key_and_a_value() -> None:
             parse_setting(text)
 
 
-def test_a_dump_is_the_configuration() -> None:
+def test_dump_round_trips() -> None:
     configuration = load(None, {"source.rate": 12.5, "models.detector.path": "n.onnx", "slam.graph.forget_s": 0.7})
     assert msgspec.convert(dump(configuration), Configuration) == configuration
     assert msgspec.json.decode(msgspec.json.encode(configuration), type=Configuration) == configuration
@@ -205,7 +205,7 @@ def test_every_key_is_a_field_and_has_a_meaning() -> None:
         ("[slam.weights]\nmode = 'paper'\n", "slam.weights.mode", "WeightsConfig in birdslam/graph/weights.py"),
     ],
 )
-def test_a_constant_in_a_file_is_refused_and_its_place_named(tmp_path: Path, text: str, key: str, place: str) -> None:
+def test_a_constant_in_a_file_is_rejected_with_its_definition(tmp_path: Path, text: str, key: str, place: str) -> None:
     path = write(tmp_path / "old.toml", text)
     with pytest.raises(ConfigurationError) as error:
         load(path)
@@ -223,7 +223,7 @@ def test_every_field_is_a_key_or_a_constant() -> None:
     assert why_no_key("slam.nothing", Configuration) == ""
 
 
-def test_a_constant_goes_over_all_else() -> None:
+def test_a_constant_overrides_all_other_settings() -> None:
     made = load(None, {"slam.graph.forget_s": 2.0}, constants={"slam.graph.forget_s": 3.0, "slam.graph.ego_nodes": 6})
     assert (made.slam.graph.forget_s, made.slam.graph.ego_nodes) == (3.0, 6)
     with pytest.raises(ConfigurationError, match=r"^command line: slam\.graph\.ego_nodes: .*<= 64"):
@@ -232,14 +232,14 @@ def test_a_constant_goes_over_all_else() -> None:
         load(None, constants={"slam.graph.egos": 6})
 
 
-def test_settings_part_into_keys_and_constants() -> None:
+def test_settings_are_split_into_keys_and_constants() -> None:
     assert parted({"source.stride": 2, "slam.graph.ego_nodes": 6}) == (
         {"source.stride": 2},
         {"slam.graph.ego_nodes": 6},
     )
 
 
-def test_the_papers_method_is_one_key(tmp_path: Path) -> None:
+def test_method_paper_selects_the_method_of_the_paper(tmp_path: Path) -> None:
     assert load(ROOT / "configs" / "paper.toml").slam == PAPER
     path = write(tmp_path / "a.toml", 'method = "paper"\n[slam.graph]\nforget_s = 2.0\n')
     graph = msgspec.structs.replace(PAPER.graph, forget_s=2.0)

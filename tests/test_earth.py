@@ -229,7 +229,7 @@ def test_a_table_is_read_by_what_its_columns_mean(encoding: str) -> None:
 # --- files out ---
 
 
-def test_the_files_are_valid_and_hold_the_way(tmp_path: Path) -> None:
+def test_the_files_are_valid_and_contain_the_line(tmp_path: Path) -> None:
     degrees = np.array([(51.0, -114.0), (51.1, -114.1), (51.2, -114.3)])
     way = GeoLine("ego & <more>", degrees, [0, 1_500_000_000, 3_000_000_000], {"rms_m": 1.5})
     for suffix in (".geojson", ".gpx", ".kml"):

@@ -139,7 +139,7 @@ def test_the_band_of_the_speed_is_not_drawn_across_what_is_not_valid(results: Pa
     assert all(end < drive.t_s[half] or begin > drive.t_s[half] for begin, end in spans)
 
 
-def test_the_page_is_whole_offline_and_escaped(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_page_is_complete_offline_and_escaped(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
     page = report(results, "--video", str(film(results / "film.avi"))).read_text(encoding="utf-8")
     assert "opens in any browser" in capsys.readouterr().out
     assert len(page) < 15e6
@@ -176,7 +176,9 @@ def test_the_camera_is_that_of_the_configuration_where_no_file_was_written(resul
     assert EVIL not in report(results).read_text(encoding="utf-8")
 
 
-def test_what_is_no_drive_is_one_line(tmp_path: Path, results: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_missing_or_damaged_results_are_a_one_line_error(
+    tmp_path: Path, results: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "empty").mkdir()
     assert main(["report", str(tmp_path / "empty")]) == 2
     assert "no results of `birdslam run`" in capsys.readouterr().err
@@ -207,7 +209,7 @@ def test_a_browser_draws_it_and_the_slider_moves(results: Path, tmp_path: Path, 
 
 @pytest.mark.slow  # a browser
 @pytest.mark.skipif(chromium() is None, reason="no Chromium (Debian: apt install chromium)")
-def test_what_is_wrong_with_a_page_is_told(results: Path, tmp_path: Path) -> None:
+def test_faults_of_a_page_are_reported(results: Path, tmp_path: Path) -> None:
     path = report(results)
     text = path.read_text(encoding="utf-8")
     path.write_text(text.replace('slider.addEventListener("input", move);', 'console.log("here");'), encoding="utf-8")
