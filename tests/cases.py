@@ -1,4 +1,4 @@
-"""Which cases of a law run on each change, and which by `make test-slow` alone."""
+"""Selects the cases of a parametrized test that run on each change; `make test-slow` runs the others."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 
 def first(count: int, cases: Iterable[Any]) -> list[Any]:
-    """The first so many of the cases on each change, the others marked `slow`; a tuple is the values of one case."""
+    """Marks all but the first cases as `slow`; a tuple has the values of one case."""
     found = list(cases)
     return [
         *found[:count],

@@ -1,4 +1,4 @@
-"""A page in headless Chromium: what its console says, what a script finds in it, and how it looks."""
+"""Opens a page in headless Chromium: console output, data of scripts, and a screenshot."""
 
 from __future__ import annotations
 

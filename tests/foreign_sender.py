@@ -1,4 +1,4 @@
-"""A foreign zenoh session on a vehicle's bus, without any of the bus's checks."""
+"""A foreign zenoh session on the bus of a vehicle, without the checks of the bus."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Networks without a file: what the tests of their schedule and of what becomes of their answers put in their place."""
+"""Fake networks for tests of schedules and results."""
 
 from __future__ import annotations
 

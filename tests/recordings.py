@@ -1,4 +1,4 @@
-"""What tests of sources and nodes look through: a small camera, KITTI's, and a recording without a disk."""
+"""Cameras and an in-memory recording for tests of sources and nodes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reports of drives in headless Chromium: in light, in dark, on a narrow screen; with the slider moved."""
+"""Opens reports in headless Chromium, in light, dark and narrow layouts, and moves the slider."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from tests.chromium import Seen, look
 
 LOOKS = {"light": (False, (1280, 2400)), "dark": (True, (1280, 2400)), "narrow": (False, (500, 3200))}
-# The slider goes to its middle; what the page shows then is left at its root element
+# Moves the slider to its middle and stores the state of the page in data attributes of the root element
 MOVED = """<script>(() => {
   const root = document.documentElement.dataset;
   const slider = document.getElementById("at"), picture = document.getElementById("picture");
@@ -31,7 +31,7 @@ MOVED = """<script>(() => {
 
 
 def moved(page: Path, picture: Path, way: str) -> Seen:
-    """The page with its slider in the middle."""
+    """Opens the page and moves the slider to its middle."""
     dark, size_px = LOOKS[way]
     copy = page.with_name(f".looked-at-{page.name}")  # beside it, where its other files are
     copy.write_text(page.read_text(encoding="utf-8").replace("</body>", MOVED + "</body>"), encoding="utf-8")
@@ -42,7 +42,7 @@ def moved(page: Path, picture: Path, way: str) -> Seen:
 
 
 def faults(seen: Seen, way: str) -> Iterator[str]:
-    """What a report must not show."""
+    """Yields the faults of a report."""
     yield from seen.console
     said = seen.said
     if "to" in said and (said.get("ready") != "yes" or said["from"] == said["to"]):

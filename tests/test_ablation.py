@@ -1,4 +1,4 @@
-"""What leaving an edge out must do, by algebra: on a log without noise the poses stay, and less is known of them."""
+"""Removing an edge from a noise-free log keeps the poses and increases the covariances."""
 
 from __future__ import annotations
 

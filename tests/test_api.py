@@ -1,4 +1,4 @@
-"""What a program imports: the lazy names, and the example that turns a video into tracks and a picture."""
+"""The public API: lazy names, and the example that turns a video into tracks and a picture."""
 
 from __future__ import annotations
 

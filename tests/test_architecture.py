@@ -1,4 +1,4 @@
-"""Which package may import which: the table in CONTRIBUTING.md, without exceptions."""
+"""Imports between packages follow the table in CONTRIBUTING.md."""
 
 import ast
 import re

@@ -1,4 +1,4 @@
-"""Each baseline recovers a world without noise, and does what sets it apart."""
+"""Each baseline recovers a noise-free world and has its specific properties."""
 
 from __future__ import annotations
 

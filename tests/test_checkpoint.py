@@ -1,4 +1,4 @@
-"""A pose graph restored from a checkpoint continues bit for bit, or raises an error that says why not."""
+"""A pose graph restored from a checkpoint continues bit for bit, or raises an error with the reason."""
 
 from __future__ import annotations
 

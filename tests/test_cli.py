@@ -1,4 +1,4 @@
-"""The command line: what a user can mend is one line on standard error and exit status 2."""
+"""The command line: a user error is one line on standard error and exit status 2."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The report of a drive: whole, offline, escaped, and what a browser makes of it."""
+"""The report of a drive: complete, offline, escaped, and rendered by a browser."""
 
 from __future__ import annotations
 
