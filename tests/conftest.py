@@ -1,5 +1,4 @@
-"""Where real recordings and networks lie, how property tests are run, which tests may start processes, and that these
-end with them.
+"""Folders of real recordings and networks, profiles of property tests, and the processes that tests start.
 
 `BIRDSLAM_DATA` and `BIRDSLAM_MODELS` name the folders of real recordings and networks; without them they lie in
 ../shared beside the project.
@@ -22,7 +21,7 @@ from tests.leftovers import end_with_this_process
 
 ROOT = Path(__file__).resolve().parent.parent
 
-# As the nodes, and before any library is loaded: one thread for each, since tests run side by side
+# One thread per library, as in the nodes, because tests run in parallel; set before any library is loaded
 os.environ.update(ENVIRONMENT, OPENCV_FOR_THREADS_NUM="1")
 if threads := os.environ.get("BIRDSLAM_TEST_THREADS"):  # a variant of `make test-cpus`
     names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
@@ -58,13 +57,13 @@ def _folder(variable: str, default: str) -> Path:
 
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
-    """The folder of real recordings; the test skips with its reason where there is none."""
+    """The folder of real recordings; skips the test if it is missing."""
     return _folder("BIRDSLAM_DATA", "data")
 
 
 @pytest.fixture(scope="session")
 def models_dir() -> Path:
-    """The folder of real networks; the test skips with its reason where there is none."""
+    """The folder of real networks; skips the test if it is missing."""
     return _folder("BIRDSLAM_MODELS", "models")
 
 

@@ -28,7 +28,7 @@ SPECIAL_TOKENS = (
 
 
 def mutated(chance: Chance, good: bytes, donor: bytes) -> bytes:
-    """Flipped, lost, doubled and foreign bytes; now and then nothing but noise, or a cut."""
+    """Flips, removes, repeats and inserts bytes; sometimes returns noise or a truncation."""
     kind = chance.randrange(20)
     if kind == 0:
         return chance.randbytes(chance.randrange(300))
@@ -53,7 +53,7 @@ def mutated(chance: Chance, good: bytes, donor: bytes) -> bytes:
 
 
 def with_other_fields(chance: Chance, plain: object) -> object:
-    """Plain data with something else at one place, however deep."""
+    """Replaces one value of nested plain data."""
     if isinstance(plain, dict) and plain and chance.random() < 0.8:
         key = chance.choice(sorted(plain))
         if chance.random() < 0.1:

@@ -1,4 +1,4 @@
-"""Stands for a processor that rounds otherwise: tracked corners move by up to a ten-thousandth of a pixel.
+"""Simulates other rounding of a processor: tracked corners move by up to a ten-thousandth of a pixel.
 
 With BIRDSLAM_ROUNDING=SEED in the environment every test runs so. A test whose result depends on the last digits fails
 under some seed; kernels of other processors differ by no more (`make test-cpus`).

@@ -1,4 +1,4 @@
-"""`make test`: the tests that compute, then those that start processes, and one line that sums up both.
+"""`make test`: runs computing tests, then tests that start processes, and prints one summary line.
 
 python -m tests.run                       # both parts; the second runs where the first has failed, too
 python -m tests.run --cpus [NAME,...]     # the tests that compute, under the kernels of other processors: a table

@@ -65,7 +65,7 @@ exec env -i PATH="$PATH" container=test /lib/systemd/systemd --system --unit=tes
 
 
 def why_not() -> str:
-    """Why such a machine can't be had here; empty where it can."""
+    """Returns why this computer can't run such a machine; empty if it can."""
     if os.geteuid() != 0:
         return "a systemd of its own needs root"
     if not SYSTEMD.exists():
@@ -208,7 +208,7 @@ class Machine:
         return {line.split(" ", 1)[1]: int(line.split(" ", 1)[0]) for line in text.splitlines() if " " in line}
 
     def journal(self, *arguments: str) -> str:
-        """What journalctl says."""
+        """Returns the output of journalctl."""
         return self("journalctl", "--no-pager", "--output=cat", *arguments)
 
     def until(self, condition: object, what: str, limit_s: float = LIMIT_S) -> None:

@@ -1,4 +1,4 @@
-"""The atlas: a whole drive in bounded memory, at full resolution where it is recent."""
+"""The atlas: a whole drive in bounded memory, with full resolution of the recent past."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ def test_back_projection_undoes_projection(ground: GroundPlane, x_m: float, slop
 def test_back_projection_meets_a_road_that_bends_upwards_or_downwards(
     ground: GroundPlane, x_m: float, side: float, vertical_per_m: float
 ) -> None:
-    """Up to the crest of a road that falls away, which hides what lies beyond."""
+    """Up to the crest of a falling road, which hides the road beyond."""
     if vertical_per_m < 0.0:
         x_m = min(x_m, 0.9 * math.sqrt(2.0 * ground.height_m / -vertical_per_m))
     height_m = 0.5 * vertical_per_m * x_m * (x_m - PLANE_AT_M)

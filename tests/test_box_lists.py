@@ -1,4 +1,4 @@
-"""Detectors that answer with lists of boxes: SSD's shifted priors, YOLOv8-like and DETR-like exports."""
+"""Decoders of box lists: SSD priors, YOLOv8-like and DETR-like exports."""
 
 from __future__ import annotations
 
