@@ -17,7 +17,7 @@ CORES := $(or $(shell nproc 2>/dev/null),2)
 unexport PYTHONDONTWRITEBYTECODE
 ON_EACH_CHANGE := not slow and not faults and not onroad
 
-.PHONY: picture setup lock newest browser test test-cpus test-cpus-sample test-slow pythons wheel-test index-test fuzz faults onroad perf lint types train demo demo-kitti clean
+.PHONY: picture setup lock newest browser exiftool test test-cpus test-cpus-sample test-slow pythons wheel-test index-test fuzz faults onroad perf lint types train demo demo-kitti clean
 
 setup: $(VENV)/.ready
 
@@ -48,8 +48,15 @@ browser:
 			&& apt-get update -q && apt-get install -qy --no-install-recommends chromium; } \
 		|| echo "no Chromium: tests of pages in a browser skip (Debian, as root: apt-get install chromium)"
 
+# Installs ExifTool for tests of GNSS tracks in films (Debian, as root); without it these tests skip
+exiftool:
+	@command -v exiftool >/dev/null \
+		|| { test "$$(id -u)" = 0 && command -v apt-get >/dev/null \
+			&& apt-get update -q && apt-get install -qy --no-install-recommends libimage-exiftool-perl; } \
+		|| echo "no ExifTool: tests of GNSS tracks skip (Debian, as root: apt-get install libimage-exiftool-perl)"
+
 # Runs computing tests first, one per core, then tests that start processes, three at a time
-test: browser setup
+test: browser exiftool setup
 	@$(BIN)/python -m tests.run
 
 # Runs computing tests with the kernels of other processors, or of VARIANT="NAME,..." (perf/accuracy/cpus.py)

@@ -1,4 +1,4 @@
-"""`birdslam export`: a drive or a recording in the formats of others."""
+"""`birdslam export`: exports a drive or a recording to another format."""
 
 from __future__ import annotations
 
@@ -17,13 +17,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = "results of `birdslam run --output`, or for --ros2 a recording of --record"
     parser.add_argument("drive", type=Path, metavar="DIR|FILE.mcap", help=text)
     what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument("--ros2", type=Path, metavar="DIR", help="write a ROS 2 bag: a new directory")
+    what.add_argument("--ros2", type=Path, metavar="DIR", help="write a ROS 2 bag, a new directory")
     text = "colmap, nerfstudio: images, camera poses and points in metres; tum, kitti: camera poses; geojson: on Earth"
     what.add_argument("--format", choices=FORMATS, help=text)
     parser.add_argument("--output", type=Path, metavar="PATH", help="the new file or directory of --format")
-    parser.add_argument("--images", default="", metavar="SOURCE", help="source of the images, where it has moved")
+    parser.add_argument("--images", default="", metavar="SOURCE", help="source of the images, if it has moved")
     parser.add_argument("--every-m", type=float, default=0.5, metavar="M", help="distance between images (default 0.5)")
-    parser.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap", help="of the ROS 2 bag (mcap)")
+    parser.add_argument(
+        "--storage", choices=("mcap", "sqlite3"), default="mcap", help="storage of the ROS 2 bag (mcap)"
+    )
 
 
 def run(options: argparse.Namespace) -> int:
@@ -40,5 +42,5 @@ def run(options: argparse.Namespace) -> int:
         frames = write_bag(recording, options.ros2, options.storage)
     print(f"{frames} frames of {options.drive} as a ROS 2 bag: {options.ros2}")
     if not recording.complete:
-        print(f"{options.drive} was cut off; the bag has the frames up to there")
+        print(f"{options.drive} is incomplete; the bag has its readable part")
     return 0
