@@ -15,7 +15,7 @@ from birdslam.geometry.se2 import SE2
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig, weighted
-from birdslam.lanes.amodal.lane_edges import LaneEdgesConfig, Station, lane_stations, stations
+from birdslam.lanes.amodal.lane_edges import LaneEdgesConfig, Station, fit_stations, lane_stations
 from birdslam.types import EgoEdge, Estimate, LandmarkEdge, LandmarkKind, Measurements
 
 CONFIG = LaneEdgesConfig()
@@ -70,10 +70,10 @@ def test_it_is_sure_across_the_lane_and_silent_along_it(yaw_rad: float, aside_m:
 def test_two_lanes_have_landmarks_of_their_own() -> None:
     points = np.concatenate([line(0.0, 2.0), line(0.0, -2.0)])
     lanes = np.repeat([5, 6], [len(line(0.0, 2.0))] * 2)
-    both, one = stations(points, lanes, CONFIG), stations(points[lanes == 5], lanes[lanes == 5], CONFIG)
+    both, one = fit_stations(points, lanes, CONFIG), fit_stations(points[lanes == 5], lanes[lanes == 5], CONFIG)
     assert one
     assert len({landmark for landmark, _, _ in both}) == len(both) == 2 * len(one)
-    assert stations(points, np.full(len(points), -1), CONFIG) == []
+    assert fit_stations(points, np.full(len(points), -1), CONFIG) == []
 
 
 def test_no_station_of_a_stub_or_of_a_blot() -> None:

@@ -20,16 +20,16 @@ from birdslam.bench.lanes.true_vehicles import VehicleScores, true_place
 from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
-from birdslam.lanes.curves import basis, moved
+from birdslam.lanes.curves import basis, transform_curves
 from birdslam.lanes.ego_lane import EgoLane
 from birdslam.lanes.line_filter import PLANE_AT_M
-from birdslam.lanes.line_tracker import LineTracker, still_lines
+from birdslam.lanes.line_tracker import LineTracker, find_lines_in_image
 from birdslam.lanes.occupancy import MAX_DISTANCE_M, with_users
 from birdslam.lanes.outline import lane_mask, lane_px, line_px
-from birdslam.lanes.paint import RESOLVED_M, LinePoints, paint_points
+from birdslam.lanes.paint import MAX_UNMASKED_PIXEL_M, LinePoints, paint_points
 from birdslam.lanes.road_view import road_view
 from birdslam.lanes.topology import lane_row
-from birdslam.lanes.traffic import STATED_SIDE, Traffic, TrafficState, stated
+from birdslam.lanes.traffic import STATED_SIDE_EVIDENCE, Traffic, TrafficState, initial_state
 from birdslam.lanes.users import UserInEgo, person_in_ego
 from birdslam.outputs.drive_video import MAX_SCALE, MAX_WIDTH_PX, SideBySide
 from birdslam.outputs.line_map import LineMap
@@ -62,7 +62,7 @@ steps = st.tuples(st.floats(-1, 4), st.floats(-0.5, 0.5), st.floats(-0.1, 0.1))
 @given(curves, steps)
 def test_a_moved_curve_lies_where_it_lay(curve: tuple[float, ...], step: tuple[float, float, float]) -> None:
     old, T_old_new = np.array(curve), SE2(*step)
-    new, _ = moved(old, T_old_new)
+    new, _ = transform_curves(old, T_old_new)
     x = np.array([0.0, 3.0, 8.0])
     at = T_old_new @ np.column_stack([x, basis(x) @ new])
     assert np.abs(basis(at[:, 0]) @ old - at[:, 1]).max() < 0.03  # a cubic turned is a cubic to third order
@@ -71,11 +71,13 @@ def test_a_moved_curve_lies_where_it_lay(curve: tuple[float, ...], step: tuple[f
 @given(curves, steps)
 def test_the_derivative_of_a_moved_curve(curve: tuple[float, ...], step: tuple[float, float, float]) -> None:
     old, T_old_new = np.array(curve), SE2(*step)
-    _, J = moved(old, T_old_new)
+    _, J = transform_curves(old, T_old_new)
     size = np.array([1e-4, 1e-5, 1e-6, 1e-7])
     for k in range(4):
         by = np.eye(4)[k] * size[k]
-        numeric = (moved(old + by, T_old_new)[0] - moved(old - by, T_old_new)[0]) / (2.0 * size[k])
+        numeric = (transform_curves(old + by, T_old_new)[0] - transform_curves(old - by, T_old_new)[0]) / (
+            2.0 * size[k]
+        )
         # In a turn of 0.1 rad the first order that the filter takes is good to some percent
         assert np.abs((numeric - J[:, k]) * size[k] / size).max() < 0.12 * max(
             1.0, np.abs(J[:, k] * size[k] / size).max()
@@ -127,7 +129,7 @@ def picture(
 @pytest.mark.parametrize("bend", [0.0, 0.004])
 def test_the_lines_of_one_image_and_its_pitch(pitch_rad: float, bend: float) -> None:
     image, masks = picture(SE2(0.0, 0.3, 0.0), (5.2, 1.7, -1.8), (False, True, False), bend, pitch_rad)
-    lines, ground = still_lines(CAMERA, image, masks, NOBODY)
+    lines, ground = find_lines_in_image(CAMERA, image, masks, NOBODY)
     row = lane_row(lines)
     assert row.ego is not None
     own = row.lanes[row.ego]
@@ -355,9 +357,9 @@ def test_a_far_ridge_that_no_network_has_is_no_line_where_kerbs_and_paint_are_on
     image, masks = picture(SE2(), (1.7, -1.8), (False, False))
     masked, unseen = points_of(image, masks), points_of(image, Segmentation(masks.road, np.zeros_like(masks.lane)))
     pixel_m = 1.0 / CAMERA.fx_px
-    assert 0.9 * RESOLVED_M < unseen.x_m.max() * pixel_m <= RESOLVED_M
-    assert masked.x_m.max() * pixel_m > 1.2 * RESOLVED_M
-    assert np.count_nonzero(masked.x_m * pixel_m <= RESOLVED_M) == len(unseen)
+    assert 0.9 * MAX_UNMASKED_PIXEL_M < unseen.x_m.max() * pixel_m <= MAX_UNMASKED_PIXEL_M
+    assert masked.x_m.max() * pixel_m > 1.2 * MAX_UNMASKED_PIXEL_M
+    assert np.count_nonzero(masked.x_m * pixel_m <= MAX_UNMASKED_PIXEL_M) == len(unseen)
 
 
 def test_grass_that_a_network_takes_for_road_and_paint_bears_no_line() -> None:
@@ -399,7 +401,7 @@ def test_nothing_is_seen_on_a_bare_road_and_nothing_breaks() -> None:
     image = np.full((CAMERA.height_px, CAMERA.width_px), 90, np.uint8)
     for road in (True, False):
         masks = Segmentation(road=np.full(image.shape, road), lane=np.zeros(image.shape, bool))
-        lines, _ = still_lines(CAMERA, image, masks, NOBODY)
+        lines, _ = find_lines_in_image(CAMERA, image, masks, NOBODY)
         assert not [line for line in lines if line.kind is not LineKind.EDGE]
 
 
@@ -446,7 +448,7 @@ def test_a_bright_kerbstone_past_the_roads_edge_is_no_bound(kerb_m: float, bound
 
 
 def test_a_lane_with_one_line_is_completed_and_says_so() -> None:
-    row = lane_row((line(1, 1.6),), usual_m=3.2, usual_sigma_m=0.2)
+    row = lane_row((line(1, 1.6),), mean_width_m=3.2, mean_width_sigma_m=0.2)
     assert row.ego == 0
     (own,) = row.lanes
     assert (own.left, own.right, own.right_bound) == (1, None, Bound.WIDTH)
@@ -552,9 +554,9 @@ def test_a_further_road_user_costs_few_calls() -> None:
 def test_curves_move_together_as_each_alone() -> None:
     rng = np.random.default_rng(0)
     old, step = rng.normal(size=(5, 4)) * [3.0, 0.1, 5e-3, 5e-5], SE2(1.2, -0.1, 0.05)
-    new, J = moved(old, step)
+    new, J = transform_curves(old, step)
     for k in range(5):
-        alone, of_it = moved(old[k], step)
+        alone, of_it = transform_curves(old[k], step)
         assert np.array_equal(new[k], alone)
         assert np.array_equal(J[k], of_it)
 
@@ -623,7 +625,7 @@ def test_the_side_of_the_road_is_stated_and_corrected_by_who_comes() -> None:
 
     def oncoming(drives_on: str, come_at_m: float | None = None) -> tuple[float, float]:
         """Of somebody new at the left and at the right, whose way is not known."""
-        traffic = Traffic(stated(drives_on))
+        traffic = Traffic(initial_state(drives_on))
         for k in range(3 if come_at_m is not None else 0):
             with_users(lanes, [UserInEgo(k, SE2(30.0, come_at_m or 0.0, math.pi), cov, 4.0, 12.0)], 10.0, traffic)
         elsewhere = EgoLane().lanes(tuple(line(10 + k, y) for k, y in enumerate((5.2, 1.7, -1.8, -5.3))), 0)
@@ -732,7 +734,7 @@ def test_traffic_tells_which_way_a_lane_runs() -> None:
     before = with_users(lanes, [unknown], 10.0, traffic)
     assert before.lanes[0].oncoming is None
     assert before.lanes[1].oncoming == 0.0
-    right = 1.0 / (1.0 + math.exp(-STATED_SIDE))
+    right = 1.0 / (1.0 + math.exp(-STATED_SIDE_EVIDENCE))
     by_labels = right * 19 / 30 + (1.0 - right) / 14  # as KITTI has them
     assert before.vehicles[0].left == pytest.approx(1.0 - by_labels, abs=0.01)
     for _ in range(3):  # one car counts once

@@ -35,7 +35,7 @@ from birdslam.graph.vehicles import SHORTEST_S, VehicleNodes, cv_edges
 from birdslam.graph.weights import WeightsConfig, weighted
 from birdslam.graph.window import Window
 from birdslam.lanes.occupancy import with_users
-from birdslam.lanes.traffic import Traffic, stated
+from birdslam.lanes.traffic import Traffic, initial_state
 from birdslam.types import (
     INVALIDATING,
     BodyId,
@@ -86,7 +86,7 @@ class PoseGraph:
             solver()
         self.window: Window | None = None  # None before the first frame
         self._people: tuple[FollowedPerson, ...] = ()  # in the ego frame of the newest frame
-        self._traffic = Traffic(stated(config.drives_on))
+        self._traffic = Traffic(initial_state(config.drives_on))
 
     def optimise(self, measurements: Measurements, records: Sequence[object] = ()) -> Estimate:
         """Adds the edges of one frame and returns its poses, velocities and covariances.

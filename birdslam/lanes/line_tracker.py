@@ -1,7 +1,7 @@
-"""Lines over a drive: from each image's points to lines with ids that last.
+"""Tracks the lines of a drive: from the points of each image to lines with persistent ids.
 
-An image without a past is searched for the shape of its lines (`parallel_search`); from then on the filter's prediction
-says where each is, and only what lies on no known line can be a new one.
+The first image is searched for the common shape of its lines (`parallel_search`). Later images correct the predicted
+lines of the filter; points on no known line initialize new lines.
 """
 
 from __future__ import annotations
@@ -18,29 +18,29 @@ from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.lanes.curves import basis
 from birdslam.lanes.line_filter import LineFilter, Support, Tilt
-from birdslam.lanes.paint import LinePoints, double_share, edge_points, paint_points
-from birdslam.lanes.parallel_search import SEARCHED_M, Peak, Shape, find_lines, find_shape
-from birdslam.lanes.road_view import RoadView, nearest_m, road_view
+from birdslam.lanes.paint import LinePoints, double_line_share, edge_points, paint_points
+from birdslam.lanes.parallel_search import MAX_SEARCH_M, Peak, Shape, find_lines, find_shape
+from birdslam.lanes.road_view import RoadView, nearest_visible_m, road_view
 from birdslam.lanes.tracked_lines import LEFT_EDGE, PAINT, RIGHT_EDGE, Track, TrackedLines, existence_of
 from birdslam.perception import Segmentation
 from birdslam.types import LaneLine
 
-MOVED_M = 0.8  # min. distance travelled between two updates; images from one place have common errors
+MIN_STEP_M = 0.8  # min. distance travelled between two updates; images from one place have common errors
 STATIONARY_UPDATES = 4  # max. number of updates of a stationary car
 MIN_PAINT_M, MIN_EDGE_M = 2.4, 8.0  # evidence of a new line
 CERTAIN_M = 5.0  # evidence that confirms a line in one image
-APART_M = 0.45  # min. distance from a known line
-EDGE_WEIGHT = 0.3  # of an edge's points in the search, since side roads disturb a mask's border
+MIN_SPACING_M = 0.45  # min. distance from a known line
+EDGE_WEIGHT_RATIO = 0.3  # of an edge's points in the search, since side roads disturb a mask's border
 MAX_LINES = 9
 IN_VIEW_M = 8.0  # visible length of a line in which paint would be detected
 CONFIRMED, MAX_SCORE = 3.0, 8.0
-SEEN_M = 2.0  # of paint, for a detection of the line
+MIN_SEEN_PAINT_M = 2.0  # of paint, for a detection of the line
 SAME_M = 0.3  # max. distance of two tracks of one line, from 5 to 20 m
-FORGOTTEN_M = -2.0  # end of a line behind the ego at which it is dropped
+MIN_END_M = -2.0  # end of a line behind the ego at which it is dropped
 NEAR_M, FAR_M = 5.0, 25.0  # range in which a line is tested
-# Lines closer than NARROW_M bound no lane: the score of one without paint decreases faster by this factor
-NARROW_M, CONTESTED_COST = 1.5, 3.0
-PAST_EDGE_M, MAX_ROAD_PAST = 0.8, 0.35  # distance past an edge, max. share of road there
+# Lines closer than MIN_LANE_WIDTH_M bound no lane: the score of one without paint decreases faster by this factor
+MIN_LANE_WIDTH_M, CONTESTED_COST_RATIO = 1.5, 3.0
+PAST_EDGE_M, MAX_ROAD_PAST_RATIO = 0.8, 0.35  # distance past an edge, max. share of road there
 MIN_EXISTENCE, MIN_IMAGES = 0.4, 4.0  # a line with a lower existence after MIN_IMAGES is dropped
 RESTART_M = 10.0  # distance travelled assumed for the first image
 # The lines are lost if they explain less than LOST_RATIO of the paint, and a new search BETTER_RATIO times as much
@@ -60,7 +60,7 @@ class LineTracker:
         """
         self.camera = camera
         self._yield_core = yield_core
-        self._certain_m = certain_m
+        self._confirmation_m = certain_m
         self._next = 0
         self.clear()
 
@@ -69,7 +69,7 @@ class LineTracker:
         self._filter = LineFilter()
         self._tracks: list[Track] = []
         self._T_world_filter: SE2 | None = None
-        self._standing = 0
+        self._stationary_updates = 0
         self.tilt = Tilt()  # of the road in the last image against its ground
         self._road_from_m = 0.0
         self._height_m, self._sigma_roll_rad = self.camera.height_m, self.camera.tilt_sigma_rad  # of the last image
@@ -85,11 +85,10 @@ class LineTracker:
         search_tilt: bool = False,
         bonnet_px: Floats | None = None,
     ) -> None:
-        """One image: `ground` under its camera, its masks, and the boxes (B, 4) of vehicles in it.
+        """Updates the lines from one image, its masks, the `ground` under its camera and the vehicles' boxes (B, 4).
 
-        `bonnet_px` (N, 2) is the edge of the car's own bonnet, where one is in view.
-        `sigma_tilt_rad`: 1-sigma of the ground's pitch and roll. `search_tilt`: the pitch is as uncertain as that says,
-        and this image alone has to show it.
+        `bonnet_px` (N, 2) is the edge of the ego's bonnet, if it is in view. `sigma_tilt_rad` is the 1-sigma of the
+        ground's pitch and roll. `search_tilt`: estimate the pitch from this image alone, with that prior.
         """
         sigma_pitch_rad, self._sigma_roll_rad = sigma_tilt_rad
         self._height_m = ground.height_m
@@ -97,54 +96,54 @@ class LineTracker:
         if travelled_m is None:
             return
         view = road_view(self.camera, ground, image, segmentation, boxes_px, bonnet_px)
-        self._road_from_m = nearest_m(self.camera, ground, bonnet_px)
+        self._road_from_m = nearest_visible_m(self.camera, ground, bonnet_px)
         self._yield_core()
         paint = paint_points(view)
         self._yield_core()
         first_tilt_rad = 0.0
         if not len(self._filter):
             shape, found = self._search(view, paint, sigma_pitch_rad if search_tilt else 0.0)
-            first_tilt_rad = self._begin(shape, found)
+            first_tilt_rad = self._restart_filter(shape, found)
         if not len(self._filter):
             return
         points, of, seen = self._correct(view, paint, sigma_pitch_rad, travelled_m, first_tilt_rad, search_tilt)
         if self._is_lost(view, paint, seen):
             self._yield_core()
             shape, found = self._search(view, paint, 0.0)
-            before = _explained_m(paint, self._tracks, seen)
+            before = _measure_explained_m(paint, self._tracks, seen)
             if sum(peak.evidence_m for kind, peak in found if kind == PAINT) > BETTER_RATIO * before:
-                self._begin(shape, found)
+                self._restart_filter(shape, found)
                 points, of, seen = self._correct(view, paint, sigma_pitch_rad, RESTART_M, 0.0, search_tilt)
-        if not self._filter.sound().all():
-            self._keep_sound()
+        if not self._filter.valid_lines().all():
+            self._drop_invalid_lines()
             return
         self._yield_core()
-        self._judge(view, points, seen)
+        self._update_scores(view, points, seen)
         self._add_lines(points, of, seen, ground.height_m)
         self._drop_lines()
 
     def _advance(self, T_world_ego: SE2) -> float | None:
-        """Moves the filter to the ego; the distance since its last update, None where it is too short for another."""
+        """Moves the filter to the ego. Returns the distance since the last update, None if it is too short."""
         if self._T_world_filter is None:
             self._T_world_filter = T_world_ego
             return RESTART_M
         step = self._T_world_filter.between(T_world_ego)
         distance = float(np.hypot(step.x_m, step.y_m))
-        if distance < MOVED_M:
-            self._standing += 1
-            return None if self._standing > STATIONARY_UPDATES else MOVED_M
-        self._standing = 0
+        if distance < MIN_STEP_M:
+            self._stationary_updates += 1
+            return None if self._stationary_updates > STATIONARY_UPDATES else MIN_STEP_M
+        self._stationary_updates = 0
         self._filter.predict(step)
         self._T_world_filter = T_world_ego
-        self._keep_sound()
+        self._drop_invalid_lines()
         for track in self._tracks:
             track.seen_from_m -= step.x_m
             track.seen_to_m -= step.x_m
         return distance
 
-    def _keep_sound(self) -> None:
+    def _drop_invalid_lines(self) -> None:
         """Drops lines with an implausible state."""
-        kept = np.flatnonzero(self._filter.sound())
+        kept = np.flatnonzero(self._filter.valid_lines())
         if len(kept) < len(self._tracks):
             self._filter.keep(kept)
             self._tracks = [self._tracks[k] for k in kept.tolist()]
@@ -154,30 +153,30 @@ class LineTracker:
     ) -> tuple[Shape | None, list[tuple[int, Peak]]]:
         """Returns the lines of the first image with their classes, and their common shape."""
         left, right = edge_points(view, np.zeros(len(view.x_m)))
-        edges = (replace(edge, weight=EDGE_WEIGHT * edge.weight) for edge in (left, right))
-        shape = find_shape(_joined(paint, *edges), self._height_m, sigma_tilt_rad)
+        edges = (replace(edge, weight=EDGE_WEIGHT_RATIO * edge.weight) for edge in (left, right))
+        shape = find_shape(_join(paint, *edges), self._height_m, sigma_tilt_rad)
         found: list[tuple[int, Peak]] = []
         if shape is None:
             return None, found
         curve = np.array([0.0, shape.heading, shape.curvature_per_m, 0.0])
-        for kind, points, least_m, most in (
+        for kind, points, min_m, most in (
             (PAINT, paint, MIN_PAINT_M, MAX_LINES - 2),
             (LEFT_EDGE, left, MIN_EDGE_M, 1),
             (RIGHT_EDGE, right, MIN_EDGE_M, 1),
         ):
             turned = points.tilted(self._height_m, shape.tilt_rad)
-            found += [(kind, peak) for peak in find_lines(turned, curve, least_m, APART_M, most)]
-            if kind == PAINT and found:  # paint says better than a mask's border where the road goes
+            found += [(kind, peak) for peak in find_lines(turned, curve, min_m, MIN_SPACING_M, most)]
+            if kind == PAINT and found:  # paint gives the heading more precisely than a mask
                 curve[1] = np.average([p.heading for _, p in found], weights=[p.evidence_m for _, p in found])
         return shape, found
 
-    def _begin(self, shape: Shape | None, found: list[tuple[int, Peak]]) -> float:
+    def _restart_filter(self, shape: Shape | None, found: list[tuple[int, Peak]]) -> float:
         """Restarts the filter with these lines; returns their tilt."""
         self._tracks = [Track(kind, score=1.0) for kind, _ in found]
         if shape is None:
             self._filter = LineFilter()
             return 0.0
-        self._filter.begin(
+        self._filter.restart(
             np.array([peak.offset_m for _, peak in found]),
             np.array([peak.heading for _, peak in found]),
             shape.curvature_per_m,
@@ -194,7 +193,7 @@ class LineTracker:
         first_tilt_rad: float,
         level: bool,
     ) -> tuple[LinePoints, Ints, list[Support]]:
-        """Corrects the filter by one image: its points, the class of each, and what was seen of each line."""
+        """Corrects the filter by one image. Returns its points, their classes and the support of each line."""
         points, of = self._with_edges(view, paint)
         classes = np.array([track.kind for track in self._tracks])
         seen, self.tilt = self._filter.update(
@@ -207,12 +206,12 @@ class LineTracker:
 
         Where vehicles hide all of them, the paint beside is another line's and says nothing of theirs.
         """
-        near_m = float(paint.weight[paint.masked & (paint.x_m < SEARCHED_M)].sum())
-        if near_m <= LOST_M or _explained_m(paint, self._tracks, seen) >= LOST_RATIO * near_m:
+        near_m = float(paint.weight[paint.masked & (paint.x_m < MAX_SEARCH_M)].sum())
+        if near_m <= LOST_M or _measure_explained_m(paint, self._tracks, seen) >= LOST_RATIO * near_m:
             return False
-        there = (view.x_m > NEAR_M) & (view.x_m < SEARCHED_M)
+        there = (view.x_m > NEAR_M) & (view.x_m < MAX_SEARCH_M)
         painted = [k for k, track in enumerate(self._tracks) if track.kind == PAINT]
-        in_view_m = [view.row_m[there & self._in_view(view, k)[1]].sum() for k in painted]
+        in_view_m = [view.row_m[there & self._project_line(view, k)[1]].sum() for k in painted]
         return not painted or max(in_view_m) > IN_VIEW_M
 
     def _with_edges(self, view: RoadView, paint: LinePoints) -> tuple[LinePoints, Ints]:
@@ -221,39 +220,39 @@ class LineTracker:
         shape[0] = 0.0
         left, right = edge_points(view, basis(view.x_m) @ shape)
         of = np.repeat([PAINT, LEFT_EDGE, RIGHT_EDGE], [len(paint), len(left), len(right)])
-        return _joined(paint, left, right), of
+        return _join(paint, left, right), of
 
     def _reference(self) -> int:
         """Returns the line with the smallest covariance."""
         return int(np.argmin([self._filter.across_sigma_m(k, np.array([15.0]))[0] for k in range(len(self._tracks))]))
 
-    def _judge(self, view: RoadView, points: LinePoints, seen: list[Support]) -> None:
+    def _update_scores(self, view: RoadView, points: LinePoints, seen: list[Support]) -> None:
         """Updates the scores of the lines, their ranges and their share of paint."""
-        contested = self._contested(points, seen)
+        contested = self._find_contested(points, seen)
         for k, (track, support) in enumerate(zip(self._tracks, seen, strict=True)):
             x, rows = view.x_m, np.arange(len(view.x_m))
-            column, clear = self._in_view(view, k)
+            column, clear = self._project_line(view, k)
             visible_m = float(view.row_m[clear & (x > NEAR_M) & (x < FAR_M)].sum())
             mine = points.of(support.points)
             if track.kind != PAINT:
                 side = 1 if track.kind == LEFT_EDGE else -1
                 past = np.clip(column + side * round(PAST_EDGE_M / (view.y_m[1] - view.y_m[0])), 0, len(view.y_m) - 1)
                 looked = clear & (x > NEAR_M) & (x < FAR_M) & ~view.outside[rows, past] & ~view.hidden[rows, past]
-                if view.row_m[looked & view.road[rows, past]].sum() > MAX_ROAD_PAST * max(
+                if view.row_m[looked & view.road[rows, past]].sum() > MAX_ROAD_PAST_RATIO * max(
                     view.row_m[looked].sum(), 1.0
                 ):
                     track.score -= 1.0
                     continue
             support_m = _length_m(mine)
             track.evidence_m += support_m
-            if support_m >= SEEN_M:
+            if support_m >= MIN_SEEN_PAINT_M:
                 track.score = min(track.score + (1.0 if mine.masked.mean() > 0.3 else 0.5), MAX_SCORE)
                 track.seen_from_m = (
                     min(track.seen_from_m, float(mine.x_m.min())) if track.looks else float(mine.x_m.min())
                 )
                 track.seen_to_m = max(track.seen_to_m, float(np.quantile(mine.x_m, 0.98)))
             elif visible_m > IN_VIEW_M:
-                track.score -= CONTESTED_COST if k in contested else 1.0
+                track.score -= CONTESTED_COST_RATIO if k in contested else 1.0
             near = (x > PROFILE_M[0]) & (x < PROFILE_M[1]) & clear
             length_m = float(view.row_m[near].sum())
             if length_m > 6.0 and track.kind == PAINT:
@@ -266,15 +265,15 @@ class LineTracker:
                 if len(yellow):
                     track.coloured = min(track.coloured + 1.0, 8.0)
                     track.yellow += (float(np.median(yellow)) - track.yellow) / track.coloured
-                double = double_share(view, mine.of(profile))
+                double = double_line_share(view, mine.of(profile))
                 if double is not None:
                     track.resolved = min(track.resolved + 1.0, 8.0)
                     track.double += (double - track.double) / track.resolved
             elif track.kind != PAINT:
                 track.looks += 1.0
 
-    def _in_view(self, view: RoadView, k: int) -> tuple[Ints, NDArray[np.bool_]]:
-        """In each row of the view, which is of a plane: the line's column, and whether nothing hides it there."""
+    def _project_line(self, view: RoadView, k: int) -> tuple[Ints, NDArray[np.bool_]]:
+        """Returns the line's column in each row of the view, and whether it is visible there."""
         x = view.x_m
         on_road_m, _ = self.tilt.applied(x, np.zeros(len(x)), self._height_m)
         y = (basis(on_road_m) @ self._filter.curves[k]) * x / on_road_m
@@ -283,18 +282,18 @@ class LineTracker:
         at, rows = np.clip(column, 0, len(view.y_m) - 1), np.arange(len(x))
         return column, inside & ~view.outside[rows, at] & ~view.hidden[rows, at]
 
-    def _contested(self, points: LinePoints, seen: list[Support]) -> set[int]:
-        """Lines beside which the image has another, sure line's paint: lines of one road neither meet nor cross."""
+    def _find_contested(self, points: LinePoints, seen: list[Support]) -> set[int]:
+        """Returns the lines near a confirmed, visible painted line: lines of one road neither meet nor cross."""
         ys = self._filter.curves @ basis(np.arange(NEAR_M, FAR_M, 2.0)).T
         there = [
             j
             for j, (track, support) in enumerate(zip(self._tracks, seen, strict=True))
-            if track.kind == PAINT and track.line >= 0 and _length_m(points.of(support.points)) >= SEEN_M
+            if track.kind == PAINT and track.line >= 0 and _length_m(points.of(support.points)) >= MIN_SEEN_PAINT_M
         ]
         return {
             k
             for k, track in enumerate(self._tracks)
-            if track.kind == PAINT and any(j != k and np.abs(ys[j] - ys[k]).min() < NARROW_M for j in there)
+            if track.kind == PAINT and any(j != k and np.abs(ys[j] - ys[k]).min() < MIN_LANE_WIDTH_M for j in there)
         }
 
     def _add_lines(self, points: LinePoints, of: Ints, seen: list[Support], height_m: float) -> None:
@@ -306,14 +305,16 @@ class LineTracker:
         curve = self._filter.curves[like]
         at = basis(np.array([10.0]))[0]
         turned = points.tilted(height_m, self.tilt.tangent_rad, self.tilt.vertical_per_m)
-        for kind, least_m in ((PAINT, MIN_PAINT_M), (LEFT_EDGE, MIN_EDGE_M), (RIGHT_EDGE, MIN_EDGE_M)):
+        for kind, min_m in ((PAINT, MIN_PAINT_M), (LEFT_EDGE, MIN_EDGE_M), (RIGHT_EDGE, MIN_EDGE_M)):
             if kind != PAINT and any(track.kind == kind for track in self._tracks):
                 continue
             mine = turned.of(free & (of == kind))
-            for peak in find_lines(mine, curve, least_m, APART_M, 3 if kind == PAINT else 1):
+            for peak in find_lines(mine, curve, min_m, MIN_SPACING_M, 3 if kind == PAINT else 1):
                 there = at @ np.array([peak.offset_m, peak.heading, curve[2], curve[3]])
                 known = self._filter.curves @ at
-                taken = [abs(there - y) < APART_M for y, t in zip(known, self._tracks, strict=True) if t.kind == kind]
+                taken = [
+                    abs(there - y) < MIN_SPACING_M for y, t in zip(known, self._tracks, strict=True) if t.kind == kind
+                ]
                 if any(taken) or len(self._tracks) >= MAX_LINES:
                     continue
                 self._filter.add(peak.offset_m, peak.heading, like, kind != PAINT)
@@ -328,7 +329,7 @@ class LineTracker:
             track = self._tracks[k]
             if track.looks >= MIN_IMAGES and existence_of(track) < MIN_EXISTENCE:
                 continue
-            if track.score <= 0.0 or (track.looks and track.seen_to_m < FORGOTTEN_M):
+            if track.score <= 0.0 or (track.looks and track.seen_to_m < MIN_END_M):
                 continue
             if any(self._tracks[j].kind == track.kind and np.all(np.abs(ys[j] - ys[k]) < SAME_M) for j in kept):
                 continue
@@ -337,7 +338,7 @@ class LineTracker:
         self._filter.keep(np.array(kept, dtype=np.int64))
         self._tracks = [self._tracks[k] for k in kept]
         for track in self._tracks:
-            if track.line < 0 and (track.score >= CONFIRMED or track.evidence_m >= self._certain_m):
+            if track.line < 0 and (track.score >= CONFIRMED or track.evidence_m >= self._confirmation_m):
                 track.line, self._next = self._next, self._next + 1
 
     def lines(self) -> TrackedLines:
@@ -356,22 +357,22 @@ class LineTracker:
         )
 
 
-def _explained_m(paint: LinePoints, tracks: list[Track], seen: list[Support]) -> float:
+def _measure_explained_m(paint: LinePoints, tracks: list[Track], seen: list[Support]) -> float:
     """Metres of the paint that lies on lines; paint's points come first among those of an update."""
     on = [support.points for track, support in zip(tracks, seen, strict=True) if track.kind == PAINT]
     mine = np.concatenate([np.zeros(0, np.int64), *on])
-    return float(paint.weight[mine][paint.masked[mine] & (paint.x_m[mine] < SEARCHED_M)].sum())
+    return float(paint.weight[mine][paint.masked[mine] & (paint.x_m[mine] < MAX_SEARCH_M)].sum())
 
 
 def _length_m(points: LinePoints) -> float:
     return float(np.minimum(points.weight, 1.0).sum())
 
 
-def _joined(*parts: LinePoints) -> LinePoints:
+def _join(*parts: LinePoints) -> LinePoints:
     return LinePoints(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(LinePoints)))
 
 
-def still_lines(
+def find_lines_in_image(
     camera: Camera, image: NDArray[np.uint8], segmentation: Segmentation, boxes_px: Floats
 ) -> tuple[tuple[LaneLine, ...], GroundPlane]:
     """The lines of a single image, and the ground under its camera with the pitch that makes them parallel."""

@@ -1,4 +1,4 @@
-"""A lane in the image: the outline of its area, and a line as a polyline.
+"""The area of a lane in the image as an outline or a mask, and a line as a polyline.
 
 `vertical_per_m` is the road's vertical curvature over the ground (`Lanes.vertical_curvature_per_m`).
 """
@@ -16,31 +16,31 @@ from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.perception import Segmentation
 from birdslam.types import Lane, LaneLine
 
-FROM_M, STEP_M = 1.0, 0.5  # of the points of an outline
-_FAR_PX = 20_000.0  # OpenCV draws no farther
-_CLOSE_PX = 9  # gaps of a mask that are closed: its border to paint, and noise
+FROM_M, STEP_M = 1.0, 0.5  # first point and spacing of an outline
+_FAR_PX = 20_000.0  # limit of coordinates for OpenCV's drawing
+_CLOSE_PX = 9  # size of mask gaps that are closed: borders to paint, and noise
 
 
 def line_px(
     camera: Camera, ground: GroundPlane, line: LaneLine, from_m: float = FROM_M, vertical_per_m: float = 0.0
 ) -> Floats:
-    """(N, 2) pixels of a line from `from_m` to where it is known, or a crest hides it."""
-    x_m = _along(ground, from_m, line.to_m, vertical_per_m)
+    """(N, 2) pixels of a line from `from_m` to the end of its known range or to a crest."""
+    x_m = _distances_m(ground, from_m, line.to_m, vertical_per_m)
     return _px(camera, ground, x_m, np.array([line.y_m(x) for x in x_m.tolist()]), vertical_per_m)
 
 
 def lane_px(
     camera: Camera, ground: GroundPlane, lane: Lane, from_m: float = FROM_M, vertical_per_m: float = 0.0
 ) -> Floats:
-    """(N, 2) pixels of the polygon around a lane from `from_m`, along its left bound and back along its right one."""
-    x_m = _along(ground, from_m, lane.to_m, vertical_per_m)
+    """(N, 2) pixels of the polygon around a lane from `from_m`: along its left bound, back along its right one."""
+    x_m = _distances_m(ground, from_m, lane.to_m, vertical_per_m)
     left = _px(camera, ground, x_m, np.array([lane.left_m(x) for x in x_m.tolist()]), vertical_per_m)
     right = _px(camera, ground, x_m, np.array([lane.right_m(x) for x in x_m.tolist()]), vertical_per_m)
     return np.vstack([left, right[::-1]])
 
 
 def lane_mask(camera: Camera, ground: GroundPlane, lane: Lane) -> Bools:
-    """(H, W) the area of a lane in the image, also behind what stands on it."""
+    """(H, W) area of a lane in the image, vehicles on it included."""
     mask = np.zeros((camera.height_px, camera.width_px), np.uint8)
     outline = lane_px(camera, ground, lane)
     if len(outline) > 2:
@@ -48,16 +48,16 @@ def lane_mask(camera: Camera, ground: GroundPlane, lane: Lane) -> Bools:
     return mask > 0
 
 
-def visible(area: Bools, segmentation: Segmentation) -> Bools:
-    """(H, W) what the image shows of an area of the road: not what cars and kerbs cover."""
+def visible_part(area: Bools, segmentation: Segmentation) -> Bools:
+    """(H, W) part of an area of the road that no vehicle or kerb covers."""
     road = (segmentation.road | segmentation.lane).view(np.uint8)
     closed = cv2.morphologyEx(road, cv2.MORPH_CLOSE, np.ones((_CLOSE_PX, _CLOSE_PX), np.uint8)) > 0
     out: Bools = area & closed
     return out
 
 
-def _along(ground: GroundPlane, from_m: float, to_m: float, vertical_per_m: float) -> Floats:
-    """Distances along a line, up to where the sight touches a crest."""
+def _distances_m(ground: GroundPlane, from_m: float, to_m: float, vertical_per_m: float) -> Floats:
+    """Distances along a line up to where the line of sight touches a crest."""
     touches_m = math.sqrt(2.0 * ground.height_m / -vertical_per_m) if vertical_per_m < 0.0 else math.inf
     return np.arange(from_m, min(to_m, touches_m), STEP_M)
 

@@ -1,7 +1,7 @@
-"""The road seen from above, with the resolution that the image has: what lines are found in.
+"""The road from above, resampled from the image for the detection of lines.
 
-Rows lie across the road at growing distances, as far apart as the image resolves; columns are a regular lattice to the
-left and right. So a painted line is as wide in the last row as in the first.
+Rows are at growing distances, as far apart as the image resolves; columns are a regular lattice across the road. So a
+painted line is equally wide in all rows.
 """
 
 from __future__ import annotations
@@ -20,32 +20,32 @@ from birdslam.perception import Segmentation
 
 Grid = Floats32
 
-MIN_DISTANCE_M = 3.0  # of a row; most cameras see the road from 5 m on
-MAX_DISTANCE_M = 50.0
-NEAR_BONNET_M = 15.0  # no bonnet covers more of the road
-ROW_M = 0.25  # between near rows
-HALF_WIDTH_M = 10.0  # of a row
-LATTICE_M = 0.04  # between columns: a painted line of 0.12 m has three
+MIN_ROW_DISTANCE_M = 3.0  # first row; most cameras see the road from 5 m on
+MAX_ROW_DISTANCE_M = 50.0
+MAX_BONNET_DISTANCE_M = 15.0  # max. distance at which a bonnet covers the road
+ROW_STEP_M = 0.25  # between near rows
+HALF_WIDTH_M = 10.0  # half length of a row
+LATTICE_M = 0.04  # spacing of columns: a painted line of 0.12 m has three
 
 
 @dataclass(frozen=True)
 class RoadView:
-    """An image and its masks from above: (R, C) over `x_m` (R,), growing, and `y_m` (C,), growing to the left.
+    """An image and its masks from above: (R, C) over increasing `x_m` (R,) and `y_m` (C,).
 
-    `outside` is what the image does not show, `hidden` what vehicles cover.
+    `outside` marks cells outside the image, `hidden` cells that vehicles cover.
     """
 
     x_m: Floats
     y_m: Floats
-    row_m: Floats  # (R,) the length of road that a row stands for
+    row_m: Floats  # (R,) length of road of a row
     sigma_y_m: Floats  # (R,) one pixel across the road
-    pixel_rad: float  # one pixel, of a ray's slope
+    pixel_rad: float  # one pixel in the slope of a ray
     grey: Grid
     road: Bools
     paint: Bools
     hidden: Bools
     outside: Bools
-    excess: Grid | None  # yellow: (red + green) / 2 - blue; None of a grey image
+    excess: Grid | None  # yellow: (red + green) / 2 - blue; None for a grey image
 
 
 @functools.lru_cache(maxsize=4)
@@ -56,13 +56,13 @@ def _columns_m() -> Floats:
 
 
 def _rows_m(fy_px: float, height_m: float) -> Floats:
-    """Distances of the rows: `ROW_M` apart, or a pixel where that is more (a pixel is x^2 / f H on the road)."""
-    near = np.arange(MIN_DISTANCE_M, MAX_DISTANCE_M, ROW_M)
-    turn_m = np.sqrt(ROW_M * fy_px * height_m)  # from here on a pixel is more
+    """Distances of the rows: `ROW_STEP_M` apart, or one pixel (x^2 / f H on the road) where that is more."""
+    near = np.arange(MIN_ROW_DISTANCE_M, MAX_ROW_DISTANCE_M, ROW_STEP_M)
+    turn_m = np.sqrt(ROW_STEP_M * fy_px * height_m)  # beyond, one pixel is more
     near = near[near < turn_m]
     first = fy_px * height_m / turn_m  # pixels below the horizon
-    far = fy_px * height_m / np.arange(first, fy_px * height_m / MAX_DISTANCE_M, -1.0)
-    out: Floats = np.concatenate([near, far[(far > near[-1] + 0.5 * ROW_M) & (far <= MAX_DISTANCE_M)]])
+    far = fy_px * height_m / np.arange(first, fy_px * height_m / MAX_ROW_DISTANCE_M, -1.0)
+    out: Floats = np.concatenate([near, far[(far > near[-1] + 0.5 * ROW_STEP_M) & (far <= MAX_ROW_DISTANCE_M)]])
     return out
 
 
@@ -74,15 +74,15 @@ def road_view(
     boxes_px: Floats,
     bonnet_px: Floats | None = None,
 ) -> RoadView:
-    """`image` (H, W) grey or (H, W, 3) BGR; `boxes_px` (B, 4) of the vehicles in it.
+    """Resamples `image`, (H, W) grey or (H, W, 3) BGR, and its masks; `boxes_px` (B, 4) are the vehicles' boxes.
 
-    `bonnet_px` (N, 2) is the upper edge of the car's own bonnet: below it the image mirrors road and paint.
+    `bonnet_px` (N, 2) is the upper edge of the ego's bonnet: below it the image reflects road and paint.
     """
     x_m, y_m = _rows_m(camera.fy_px, ground.height_m), _columns_m()
     u, v = _pixels(camera, ground, x_m, y_m)
     outside = (u < 0.0) | (u > camera.width_px - 1) | (v < 0.0) | (v > camera.height_px - 1)
     if bonnet_px is not None:
-        near = x_m < NEAR_BONNET_M
+        near = x_m < MAX_BONNET_DISTANCE_M
         outside[near] |= v[near] > np.interp(u[near], *bonnet_px.T)
 
     def seen(plane: NDArray[np.uint8], how: int) -> NDArray[np.uint8]:
@@ -96,7 +96,7 @@ def road_view(
         excess = np.asarray(0.5 * (green + red) - blue, np.float32)
     else:
         grey = seen(image, cv2.INTER_LINEAR)
-    covered = np.zeros(segmentation.road.shape, np.uint8)  # by boxes; road that shows in their corners is seen
+    covered = np.zeros(segmentation.road.shape, np.uint8)  # by boxes; road visible in their corners is not hidden
     for x1, y1, x2, y2 in boxes_px:
         covered[max(0, int(y1)) : max(0, int(np.ceil(y2))), max(0, int(x1)) : max(0, int(np.ceil(x2)))] = 1
     covered &= ~(segmentation.road | segmentation.lane)
@@ -119,16 +119,16 @@ def road_view(
     )
 
 
-def nearest_m(camera: Camera, ground: GroundPlane, bonnet_px: Floats | None) -> float:
-    """Where the road straight ahead begins to be in view: over the bonnet's edge, or the image's."""
+def nearest_visible_m(camera: Camera, ground: GroundPlane, bonnet_px: Floats | None) -> float:
+    """Distance at which the road straight ahead enters the view: above the bonnet or at the image's border."""
     lowest = camera.height_px - 1.0
     v = lowest if bonnet_px is None else min(lowest, float(np.interp(camera.cx_px, *bonnet_px.T)))
     x_m = float(bev.pixel_to_ego(camera, ground, np.array([[camera.cx_px, v]]))[0, 0])
-    return x_m if np.isfinite(x_m) else MAX_DISTANCE_M
+    return x_m if np.isfinite(x_m) else MAX_ROW_DISTANCE_M
 
 
 def _pixels(camera: Camera, ground: GroundPlane, x_m: Floats, y_m: Floats) -> tuple[Grid, Grid]:
-    """(R, C) columns and rows of the image: as bev.ego_to_pixel, of a grid."""
+    """(R, C) columns and rows of the image: bev.ego_to_pixel for a grid."""
     ahead, left, up = ground.R_ego_cam
     right, down, depth = (
         (a * x_m - c * ground.height_m)[:, None] + b * y_m for a, b, c in zip(ahead, left, up, strict=True)

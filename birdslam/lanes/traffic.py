@@ -1,8 +1,7 @@
-"""Which way the lanes run, by the traffic that was seen in them, and on which side of the road one drives.
+"""Direction of traffic in the lanes, learned from the road users seen there, and the side on which one drives.
 
-Whoever drives beside the ego's lane tells the direction of the road beyond the line between: all lanes farther out on
-that side run alike, or the other way from a later line on. One vehicle counts once at a line. So a car that has just
-come into view, whose front is not known from its back yet, is taken for an oncoming one where others came before it.
+A moving vehicle beyond a line shows the direction of the lanes beyond that line. Each vehicle counts once per line.
+The result is the prior for a new vehicle whose front and back are not yet distinguished.
 """
 
 from __future__ import annotations
@@ -19,65 +18,61 @@ from birdslam.lanes.curves import across_sigma_m, basis
 from birdslam.lanes.users import UserInEgo
 from birdslam.types import Lane, LaneLine, Lanes
 
-AGAINST = -0.3  # cosine of a direction to the ego's, below which traffic comes towards the ego
-EVIDENCE = 2.0  # log odds that one vehicle adds: one in eight turns, overtakes or is misjudged
-MAX_LOG_ODDS = 6.0  # log odds
-# Log odds that one vehicle adds to whether those beyond a line drive, and their most: kerbs and lanes are side by side,
-# and the evidence falls with the lateral distance beyond the other lane
-DRIVES_EVIDENCE, DRIVES_MAX = 1.0, 3.0
-ALIKE_M, MIN_ALIKE = 1.5, 0.3
+MAX_ONCOMING_COS = -0.3  # max. cosine between an oncoming direction and the ego's
+DIRECTION_EVIDENCE = 2.0  # log odds per vehicle: one in eight turns, overtakes or is misjudged
+MAX_LOG_ODDS = 6.0
+# Log odds per vehicle of whether users beyond a line move, and their maximum. The evidence falls with the lateral
+# distance between the two vehicles.
+MOVING_EVIDENCE, MAX_MOVING_EVIDENCE = 1.0, 3.0
+SIMILAR_DISTANCE_M, MIN_SIMILARITY = 1.5, 0.3
 MIN_SIGMA_MPS, MAX_SIGMAS = 0.1, 30.0
-# Vehicles do not park on fast roads: log odds of driving per m/s beyond PARKED_MPS, and their maximum.
-# Of KITTI tracking's cars beside the ego's lane, each once, 0.58 stand below 14 m/s (of 317; 0.45 to 0.61 with one
-# sequence left out) and 0.34 beyond (of 71; 0.26 to 0.39)
-PARKED_MPS, PARKED_EVIDENCE, PARKED_MAX = 13.0, 0.4, 3.0
-BEYOND_SIGMAS = 2.0  # so surely beyond a line
-MEMORY_LINES = 64
-STATED_SIDE = 2.2  # log odds of the side that was stated: a few who come at the other side tell it better
-# Who comes is at first taken for one that drives along, a front for a back: of rendered sights that said so 12 % were
-# wrong where the speed was 2 to 3 sigma, 3 % at 3 to 6, none beyond. Log odds for each sigma, and those of a witness
-ALONG_EVIDENCE, SURE_SIGMAS = 1.0, 4.0
-# The share of those who drive that comes towards the ego, beside its lane and beyond all that are known: at its left
-# where one drives on the right, and at its right. By the labels of KITTI tracking, each car once, across the ego's way:
-# 19 of 30 and 54 of 57, 1 of 14 and 0 of 19
+# Vehicles do not park on fast roads: log odds of moving per m/s of the ego above MIN_FAST_ROAD_MPS, and their maximum
+MIN_FAST_ROAD_MPS, FAST_ROAD_EVIDENCE_PER_MPS, MAX_FAST_ROAD_EVIDENCE = 13.0, 0.4, 3.0
+MIN_BEYOND_SIGMAS = 2.0  # min. lateral distance beyond a line
+MAX_ENTRIES = 64
+STATED_SIDE_EVIDENCE = 2.2  # log odds of the stated side; a few oncoming vehicles on the other side outweigh it
+# A new oncoming vehicle may first be taken for one that moves along, front for back: log odds of moving along per sigma
+# of speed, and the sigmas from which a vehicle counts as evidence
+ALONG_EVIDENCE, MIN_SURE_SIGMAS = 1.0, 4.0
+# Share of oncoming vehicles among moving ones, (beside the ego's lane, beyond all known lanes): on the left of the ego
+# for right-hand traffic, and on its right. Counted in the labels of KITTI tracking.
 FAR_SIDE, NEAR_SIDE = (0.63, 0.95), (0.07, 0.03)
 
 
 class TrafficState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """For a graph's checkpoint."""
+    """State for a graph's checkpoint."""
 
     log_odds: dict[int, float] = {}
     counted: list[tuple[int, int]] = []
-    right_log_odds: float = STATED_SIDE
+    right_log_odds: float = STATED_SIDE_EVIDENCE
     sided: list[int] = []
     driving: list[tuple[int, int, float, bool]] = []
 
 
 @dataclass(frozen=True)
 class Between:
-    """The line between a road user and the ego's lane, and how far beyond it the user is."""
+    """The line between a road user and the ego's lane, and the distance of the user beyond it."""
 
     line: LaneLine
     beyond_m: float
 
 
 @dataclass(frozen=True)
-class Way:
-    """The probabilities that a road user drives and that, were it to, it comes towards the ego.
+class TrafficPrior:
+    """The probability that a road user moves, and that it is oncoming if it moves.
 
-    The latter by whether it is beside the ego's lane or beyond all that are known, at the ego's left and at its right.
+    `left`, `right`: the latter on that side of the ego, (beside the ego's lane, beyond all known lanes).
     """
 
-    drives: float
+    moving: float
     left: tuple[float, float]
     right: tuple[float, float]
 
 
 class Traffic:
-    """State: for each line the log odds that traffic beyond it, seen from the ego, comes towards the ego.
+    """State: per line the log odds that traffic beyond it is oncoming, and votes on whether users beyond it move.
 
-    And by how much likelier those beyond it drive than is known of each alone: on a motorway's other carriageway nobody
-    stands, and beyond a kerb one that does is followed by others. And the log odds that one drives on the right.
+    Also the log odds of right-hand traffic.
     """
 
     def __init__(self, state: TrafficState = TrafficState()) -> None:  # noqa: B008
@@ -85,86 +80,88 @@ class Traffic:
         self._counted = dict.fromkeys(state.counted)  # (line, vehicle), in the order of counting
         self._right = state.right_log_odds
         self._sided = dict.fromkeys(state.sided)
-        # (line, vehicle): how far beyond the line it was, and whether it drove
-        self._driving = {(line, vehicle): (beyond_m, drives) for line, vehicle, beyond_m, drives in state.driving}
+        # (line, vehicle): distance beyond the line, whether it moved
+        self._driving = {(line, vehicle): (beyond_m, moving) for line, vehicle, beyond_m, moving in state.driving}
 
     def state(self) -> TrafficState:
-        """As it stands between two frames."""
+        """The state between two frames."""
         driving = [(*key, *vote) for key, vote in self._driving.items()]
         return TrafficState(dict(self._against), list(self._counted), self._right, list(self._sided), driving)
 
     def observe(self, users: Sequence[UserInEgo], between: Sequence[Between | None]) -> None:
-        """What the road users of a frame show of the lines between them and the ego (`lines_between`)."""
+        """Learns from the road users of a frame and the lines between them and the ego (`lines_between`)."""
         for user, seen in zip(users, between, strict=True):
-            if user.walks or seen is None:
+            if user.is_pedestrian or seen is None:
                 continue
-            along, drives, key = user.cos_along, user.surely_drives, (seen.line.line, user.vehicle)
-            if along is not None and (along <= AGAINST or (along >= -AGAINST and _sigmas(user) >= SURE_SIGMAS)):
-                self._count_way(key, along < 0.0, user.T_ego_vehicle.y_m > 0.0)
-            if drives is not None and key not in self._driving:
-                self._driving[key] = seen.beyond_m, drives
-                _forget(self._driving)
+            along, moving, key = user.cos_along, user.is_moving, (seen.line.line, user.vehicle)
+            if along is not None and (
+                along <= MAX_ONCOMING_COS or (along >= -MAX_ONCOMING_COS and _speed_sigmas(user) >= MIN_SURE_SIGMAS)
+            ):
+                self._count_direction(key, along < 0.0, user.T_ego_vehicle.y_m > 0.0)
+            if moving is not None and key not in self._driving:
+                self._driving[key] = seen.beyond_m, moving
+                _drop_oldest(self._driving)
 
-    def _count_way(self, key: tuple[int, int], against: bool, at_left: bool) -> None:
+    def _count_direction(self, key: tuple[int, int], against: bool, at_left: bool) -> None:
         line, vehicle = key
         if key not in self._counted:
             self._counted[key] = None
-            odds = self._against.pop(line, 0.0) + (EVIDENCE if against else -EVIDENCE)
+            odds = self._against.pop(line, 0.0) + (DIRECTION_EVIDENCE if against else -DIRECTION_EVIDENCE)
             self._against[line] = min(max(odds, -MAX_LOG_ODDS), MAX_LOG_ODDS)
-            _forget(self._counted)
-            _forget(self._against)
-        # A vehicle to the left of the ego that drives along may be in a lane of the same direction
+            _drop_oldest(self._counted)
+            _drop_oldest(self._against)
+        # A vehicle on the left that moves along may be in another lane of the same direction
         if against and vehicle not in self._sided:
             self._sided[vehicle] = None
             evidence = math.log(FAR_SIDE[0] / NEAR_SIDE[0])
             self._right = min(max(self._right + (evidence if at_left else -evidence), -MAX_LOG_ODDS), MAX_LOG_ODDS)
-            _forget(self._sided)
+            _drop_oldest(self._sided)
 
-    def way(self, user: UserInEgo, seen: Between | None, ego_mps: float) -> Way:
-        """What is known of a road user's way; `seen` is the line between it and the ego's lane."""
-        if user.walks:
-            return Way(user.drives, (0.0, 0.0), (0.0, 0.0))
-        drives, along = user.drives, user.cos_along
-        more = min(PARKED_EVIDENCE * max(ego_mps - PARKED_MPS, 0.0), PARKED_MAX)
-        more += 0.0 if seen is None else self._drive_log_odds(seen)
+    def estimate_prior(self, user: UserInEgo, seen: Between | None, ego_mps: float) -> TrafficPrior:
+        """Estimates motion and direction of a road user; `seen` is the line between it and the ego's lane."""
+        if user.is_pedestrian:
+            return TrafficPrior(user.moving, (0.0, 0.0), (0.0, 0.0))
+        moving, along = user.moving, user.cos_along
+        more = min(FAST_ROAD_EVIDENCE_PER_MPS * max(ego_mps - MIN_FAST_ROAD_MPS, 0.0), MAX_FAST_ROAD_EVIDENCE)
+        more += 0.0 if seen is None else self._moving_log_odds(seen)
         if more:
-            drives = drives / (drives + (1.0 - drives) * math.exp(-more))
-        if along is not None and along < AGAINST:
-            return Way(drives, (1.0, 1.0), (1.0, 1.0))
+            moving = moving / (moving + (1.0 - moving) * math.exp(-more))
+        if along is not None and along < MAX_ONCOMING_COS:
+            return TrafficPrior(moving, (1.0, 1.0), (1.0, 1.0))
         odds = 0.0 if seen is None else self._against.get(seen.line.line, 0.0)
         if along is not None:
-            odds -= ALONG_EVIDENCE * _sigmas(user)
-        right = _share(self._right)
+            odds -= ALONG_EVIDENCE * _speed_sigmas(user)
+        right = _probability(self._right)
         (far, far_beyond), (near, near_beyond) = FAR_SIDE, NEAR_SIDE
 
-        def after(at_right: float, at_left: float) -> float:
+        def oncoming(at_right: float, at_left: float) -> float:
             return _with_odds(right * at_right + (1.0 - right) * at_left, odds)
 
-        return Way(
-            drives,
-            (after(far, near), after(far_beyond, near_beyond)),
-            (after(near, far), after(near_beyond, far_beyond)),
+        return TrafficPrior(
+            moving,
+            (oncoming(far, near), oncoming(far_beyond, near_beyond)),
+            (oncoming(near, far), oncoming(near_beyond, far_beyond)),
         )
 
-    def _drive_log_odds(self, seen: Between) -> float:
-        """By those beyond the same line, most by those as far beyond it."""
+    def _moving_log_odds(self, seen: Between) -> float:
+        """Log odds of moving from other users beyond the same line, weighted by lateral distance."""
         total = 0.0
-        for (line, _), (beyond_m, drives) in self._driving.items():
+        for (line, _), (beyond_m, moving) in self._driving.items():
             if line == seen.line.line:
-                apart = (beyond_m - seen.beyond_m) / ALIKE_M
-                alike = MIN_ALIKE + (1.0 - MIN_ALIKE) * math.exp(-0.5 * apart * apart)
-                total += alike if drives else -alike
-        return DRIVES_EVIDENCE * min(max(total, -DRIVES_MAX), DRIVES_MAX)
+                apart = (beyond_m - seen.beyond_m) / SIMILAR_DISTANCE_M
+                similarity = MIN_SIMILARITY + (1.0 - MIN_SIMILARITY) * math.exp(-0.5 * apart * apart)
+                total += similarity if moving else -similarity
+        return MOVING_EVIDENCE * min(max(total, -MAX_MOVING_EVIDENCE), MAX_MOVING_EVIDENCE)
 
     def with_directions(self, lanes: Lanes) -> Lanes:
-        """The lanes with the probability that their traffic is oncoming, where something showed it."""
+        """Returns the lanes with the probability of oncoming traffic where it was learned."""
         if lanes.ego_index is None:
             return lanes
         directed = tuple(self._directed(lanes, k) for k in range(len(lanes.lanes)))
         return lanes if directed == lanes.lanes else msgspec.structs.replace(lanes, lanes=directed)
 
     def _directed(self, lanes: Lanes, k: int) -> Lane:
-        """Lane `k` by the lines between it and the ego's: the innermost that is known decides."""
+        """Lane `k` with the direction learned at the innermost known line between it and the ego's lane."""
         ego, lane = lanes.ego_index, lanes.lanes[k]
         if ego is None or k == ego:
             return lane if lane.carriageway else msgspec.structs.replace(lane, oncoming=0.0)
@@ -173,37 +170,37 @@ class Traffic:
             line = lanes.lanes[index].right if k < ego else lanes.lanes[index].left
             if line is not None and line in self._against:
                 odds = self._against[line]
-                return msgspec.structs.replace(lane, oncoming=_share(odds))
+                return msgspec.structs.replace(lane, oncoming=_probability(odds))
         return lane
 
 
-def stated(drives_on: str) -> TrafficState:
-    """Before anybody was seen: one drives on the "right" or the "left"."""
-    return TrafficState(right_log_odds=STATED_SIDE if drives_on == "right" else -STATED_SIDE)
+def initial_state(drives_on: str) -> TrafficState:
+    """The initial state for driving on the "right" or the "left"."""
+    return TrafficState(right_log_odds=STATED_SIDE_EVIDENCE if drives_on == "right" else -STATED_SIDE_EVIDENCE)
 
 
-def _sigmas(user: UserInEgo) -> float:
-    """How surely it drives forward."""
+def _speed_sigmas(user: UserInEgo) -> float:
+    """Forward speed over its sigma."""
     return min(user.speed_mps / max(user.speed_sigma_mps, MIN_SIGMA_MPS), MAX_SIGMAS)
 
 
-def _share(log_odds: float) -> float:
+def _probability(log_odds: float) -> float:
     return 1.0 / (1.0 + math.exp(-log_odds))
 
 
 def _with_odds(share: float, log_odds: float) -> float:
-    """A probability, after evidence."""
+    """Updates a probability by log odds."""
     return share / (share + (1.0 - share) * math.exp(-log_odds))
 
 
-def _forget(memory: dict[Any, Any]) -> None:
-    """The oldest, where there are too many."""
-    while len(memory) > MEMORY_LINES:
+def _drop_oldest(memory: dict[Any, Any]) -> None:
+    """Drops the oldest entries above the limit."""
+    while len(memory) > MAX_ENTRIES:
         del memory[next(iter(memory))]
 
 
 def lines_between(lanes: Lanes, users: Sequence[UserInEgo]) -> list[Between | None]:
-    """For each road user the nearest line of those that surely lie between it and the ego's lane, or None."""
+    """For each road user the nearest line that surely lies between it and the ego's lane, or None."""
     if not lanes.lines or not users:
         return [None] * len(users)
     rows = [(user.T_ego_vehicle.x_m, user.T_ego_vehicle.y_m, user.cov[1, 1]) for user in users]
@@ -212,7 +209,7 @@ def lines_between(lanes: Lanes, users: Sequence[UserInEgo]) -> list[Between | No
     curves, covs = np.array(shapes), np.array([line.cov for line in lanes.lines]).reshape(-1, 4, 4)
     at = basis(np.clip(x_m, 0.0, [line.to_m for line in lanes.lines]))  # (users, lines, 4)
     line_m = (at * curves).sum(axis=2)
-    margin_m = BEYOND_SIGMAS * np.sqrt(np.maximum(variance, 0.0) + across_sigma_m(at, covs) ** 2)
+    margin_m = MIN_BEYOND_SIGMAS * np.sqrt(np.maximum(variance, 0.0) + across_sigma_m(at, covs) ** 2)
     beyond = (curves[:, 0] * y_m > 0.0) & ((y_m - line_m) * np.copysign(1.0, y_m) >= margin_m)
     farthest = np.where(beyond, np.abs(line_m), -1.0)
     nearest, found = farthest.argmax(axis=1), beyond.any(axis=1).tolist()

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from birdslam.geometry import bev
 from birdslam.geometry.arrays import Bools, Floats, Ints
 from birdslam.geometry.camera import Camera, GroundPlane
-from birdslam.lanes.line_tracker import still_lines
-from birdslam.lanes.outline import lane_mask, line_px, visible
+from birdslam.lanes.line_tracker import find_lines_in_image
+from birdslam.lanes.outline import lane_mask, line_px, visible_part
 from birdslam.lanes.topology import LaneRow, lane_row
 from birdslam.perception import Segmentation
 from birdslam.sources.recording import DatasetError
@@ -129,11 +129,11 @@ class Still:
 
 def find_lane(camera: Camera, image: NDArray[np.uint8], segmentation: Segmentation, boxes_px: Floats) -> Still:
     """The lines and the ego's lane of one image without a past."""
-    lines, ground = still_lines(camera, image, segmentation, boxes_px)
+    lines, ground = find_lines_in_image(camera, image, segmentation, boxes_px)
     row = lane_row(lines)
     area = np.zeros(image.shape[:2], dtype=bool)
     if row.ego is not None:
-        area = visible(lane_mask(camera, ground, row.lanes[row.ego]), segmentation)
+        area = visible_part(lane_mask(camera, ground, row.lanes[row.ego]), segmentation)
     return Still(lines, row, ground, area)
 
 

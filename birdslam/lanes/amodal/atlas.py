@@ -1,7 +1,7 @@
 """The atlas: trajectories and map of a whole drive, beside the graph's window, in bounded memory.
 
-Octaves: each is half as fine as the one before. What exceeds an octave's size moves on to the next one, and leaves the
-last. So each `add` costs the same, however long the drive is; by default the atlas reaches back over 500 km.
+Octaves: each has half the resolution of the one before. What exceeds the size of an octave moves to the next one and
+leaves the last one. So each `add` has a constant cost; by default the atlas covers over 500 km.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ _MAX_KEY_POSE_NS = 10**9  # between two key poses of a vehicle
 
 
 class AtlasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Resolution and length of the stored drive. A snapshot of either record stays under a mebibyte."""
+    """Resolution and length of the stored drive. By default a snapshot of either record is below 1 MiB."""
 
-    key_pose_m: Positive = 0.5  # apart, in the finest octave
-    key_pose_rad: Positive = 0.1  # or turned, in the finest octave
+    key_pose_m: Positive = 0.5  # distance between key poses in the finest octave
+    key_pose_rad: Positive = 0.1  # or rotation between them
     key_poses: Count = 1024  # in each octave
-    octaves: Count = 10  # of poses: each is half as fine as the one before
-    vehicles: Count = 64  # whose paths are kept; the longest out of sight are dropped first
-    vehicle_poses: Count = 64  # the newest of each
+    octaves: Count = 10  # of poses: each has half the resolution of the one before
+    vehicles: Count = 64  # number of paths; those out of view for longest are dropped first
+    vehicle_poses: Count = 64  # of each vehicle, the newest
     map_cell_m: Positive = 0.25  # of the map, in the finest octave
     map_cells: Count = 4096  # in each octave, of landmarks and of lanes each
-    map_octaves: Count = 5  # of the map: each is half as fine as the one before
-    epochs: Count = 2  # the newest ones: that of now, and the one whose last map updates may still come
+    map_octaves: Count = 5  # of the map: each has half the resolution of the one before
+    epochs: Count = 2  # the current one, and the one before, which may still get map updates
 
 
 class Atlas:
-    """`add` takes the graph's output for each frame; `trajectory` and `map` return records of all that was added."""
+    """`add` takes the graph's output for each frame; `trajectory` and `map` return it as records."""
 
     def __init__(self, config: AtlasConfig) -> None:
         self._config = config
@@ -52,11 +52,11 @@ class Atlas:
 
     @property
     def epochs(self) -> tuple[int, ...]:
-        """The epochs that are kept, oldest first."""
+        """The stored epochs, oldest first."""
         return tuple(self._by_epoch)
 
     def add(self, estimate: Estimate, map_update: MapUpdate | None = None) -> None:
-        """One frame. An invalid estimate adds no pose."""
+        """Adds a frame. An invalid estimate adds no pose."""
         world = self._newest = self._epoch_of(estimate.epoch)
         if estimate.valid:
             world.add_poses(estimate)
@@ -94,11 +94,11 @@ class _Epoch:
         self._frame_id = self._map_frame_id = 0
         self._t_ns = 0
         self._ego = _EgoPath(config)
-        self._paths: dict[int, _VehiclePath] = {}  # by vehicle, the longest out of sight first
+        self._paths: dict[int, _VehiclePath] = {}  # by vehicle, the one out of view for longest first
         self._landmarks, self._lanes = _MapCells(config), _MapCells(config)
 
     def add_poses(self, estimate: Estimate) -> None:
-        """The poses of the ego and the vehicles in one frame."""
+        """Adds the poses of the ego and the vehicles of a frame."""
         frame_id, t_ns = self._frame_id, self._t_ns = estimate.frame_id, estimate.t_source_ns
         self._ego.add(TimedPose(frame_id, t_ns, estimate.T_world_ego))
         for v in estimate.vehicles:
@@ -110,7 +110,7 @@ class _Epoch:
             del self._paths[next(iter(self._paths))]
 
     def add_points(self, update: MapUpdate) -> None:
-        """The map's new points."""
+        """Adds the map's new points."""
         self._map_frame_id = update.frame_id
         self._landmarks.add(update.landmarks_m)
         self._lanes.add(update.lanes_m, update.lane_ids)
@@ -119,7 +119,7 @@ class _Epoch:
         since_ns = -math.inf if last_s is None else self._t_ns - last_s * 1e9
         paths = []
         for vehicle, path in sorted(self._paths.items()):
-            poses = tuple(pose for pose in path.newest_last() if pose.t_source_ns >= since_ns)
+            poses = tuple(pose for pose in path.in_order() if pose.t_source_ns >= since_ns)
             if poses:
                 v = path.newest
                 sizes = {"label": v.label, "length_m": v.length_m, "width_m": v.width_m}
@@ -128,24 +128,24 @@ class _Epoch:
             epoch=self._epoch,
             frame_id=self._frame_id,
             t_source_ns=self._t_ns,
-            ego=tuple(pose for pose in self._ego.newest_last() if pose.t_source_ns >= since_ns),
+            ego=tuple(pose for pose in self._ego.in_order() if pose.t_source_ns >= since_ns),
             vehicles=tuple(paths),
         )
 
     def map(self) -> MapSnapshot:
-        lanes_m, lane_ids = self._lanes.newest_last()
+        lanes_m, lane_ids = self._lanes.in_order()
         return MapSnapshot(
             epoch=self._epoch,
             frame_id=self._map_frame_id,
-            landmarks_m=self._landmarks.newest_last()[0],
+            landmarks_m=self._landmarks.in_order()[0],
             lanes_m=lanes_m,
             cell_m=self._config.map_cell_m,
             lane_ids=lane_ids if any(lane >= 0 for lane in lane_ids) else (),
         )
 
 
-def _is_apart(a: SE2, b: SE2, least_m: float, least_rad: float) -> bool:
-    return math.hypot(a.x_m - b.x_m, a.y_m - b.y_m) >= least_m or abs(wrap(a.yaw_rad - b.yaw_rad)) >= least_rad
+def _is_apart(a: SE2, b: SE2, min_m: float, min_rad: float) -> bool:
+    return math.hypot(a.x_m - b.x_m, a.y_m - b.y_m) >= min_m or abs(wrap(a.yaw_rad - b.yaw_rad)) >= min_rad
 
 
 class _EgoPath:
@@ -168,7 +168,7 @@ class _EgoPath:
                 return
             pose, coarser = octave.popleft(), 2.0 * coarser
 
-    def newest_last(self) -> list[TimedPose]:
+    def in_order(self) -> list[TimedPose]:
         poses = list(chain.from_iterable(reversed(self._octaves)))
         if self._newest is not None and (not poses or poses[-1] != self._newest):
             poses.append(self._newest)
@@ -193,14 +193,14 @@ class _VehiclePath:
         ):
             self.poses.append(pose)
 
-    def newest_last(self) -> list[TimedPose]:
+    def in_order(self) -> list[TimedPose]:
         poses = list(self.poses)
         return poses if self.last is None or self.last == poses[-1] else [*poses, self.last]
 
 
 @dataclass(slots=True)
 class _MapCells:
-    """Points of the road, averaged over cells, with the newest id in each (-1: none); octaves of the cell's side."""
+    """Mean points of the road in each cell, with the newest lane id (-1: none), in octaves of the cell size."""
 
     config: AtlasConfig
     octaves: list[dict[tuple[int, int], tuple[float, float, int, int]]] = field(init=False)  # sums, count, id
@@ -217,7 +217,7 @@ class _MapCells:
             for cells in self.octaves:
                 x, y, n, lane = sums
                 key = math.floor(x / n / side_m), math.floor(y / n / side_m)
-                before = cells.pop(key, None)  # and back in as the newest
+                before = cells.pop(key, None)  # re-inserted below as the newest
                 if before is not None:
                     newest = lane if lane >= 0 else before[3]
                     sums = before[0] + x, before[1] + y, before[2] + n, newest
@@ -226,7 +226,7 @@ class _MapCells:
                     break
                 sums, side_m = cells.pop(next(iter(cells))), 2.0 * side_m
 
-    def newest_last(self) -> tuple[tuple[tuple[float, float], ...], tuple[int, ...]]:
+    def in_order(self) -> tuple[tuple[tuple[float, float], ...], tuple[int, ...]]:
         """The points, oldest first, and their ids."""
         cells = [sums for octave in reversed(self.octaves) for sums in octave.values()]
         return tuple((x / n, y / n) for x, y, n, _ in cells), tuple(lane for *_, lane in cells)

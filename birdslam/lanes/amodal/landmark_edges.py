@@ -1,6 +1,6 @@
 """Static map initialisation (paper, Sec. 3.1): CP edges of feature tracks on the road, back-projected by Eq. 1.
 
-The other landmarks are stations of lanes (lane_edges.py). graph/landmarks.py uses the edges of both.
+The other landmarks are stations of lanes (lane_edges.py).
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ class StaticMapConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sigma_height_rel: float = 0.02  # of the camera's height over the road there
     max_lane_points: int = 64  # of a frame
     lane_range_m: float = 20.0  # of lane points
-    lane_cell_m: float = 0.5  # one lane point a cell
-    attitude_memory_m: float = 1000.0  # roads are level on average: tilt is forgotten over this distance
+    lane_cell_m: float = 0.5  # one lane point per cell
+    attitude_memory_m: float = 1000.0  # correlation length of the camera's tilt; roads are level on average
 
 
 def landmark_edges(

@@ -1,8 +1,8 @@
-"""CP edges of lanes (Eq. 3): one frame's lane markings against the lanes that earlier frames put on the map.
+"""CP edges of lanes (Eq. 3): the lane markings of one frame against the lanes mapped by earlier frames.
 
-A point of a line can't be recognised along the line, so a landmark is a *station*: the crossing of a lane with a line
-of a grid in world. An edge measures the lane's position across its direction; along it the covariance is large. Only
-what one frame saw makes edges: the completed lanes combine many frames by the odometry that the edges are to correct.
+A landmark is a *station*: the intersection of a lane with a grid line in world. Its position across the lane is
+measured; along the lane the covariance is large. Only markings of single frames give edges: completed lanes combine
+many frames with the odometry that the edges correct.
 """
 
 from __future__ import annotations
@@ -20,35 +20,35 @@ from birdslam.types import LandmarkEdge, LandmarkKind
 
 Ids = Ints
 
-_CELLS = 1 << 20  # stations of one lane along one axis, before their ids repeat: 4000 km
-_MIN_SPAN = 0.7  # of a station's length that its points must span: a line through fewer follows their noise
+_CELLS = 1 << 20  # stations of one lane along one axis until ids repeat: 4000 km
+_MIN_SPAN_RATIO = 0.7  # share of a station's length that its points must span, for a stable line fit
 
 
 class LaneEdgesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Which points of a lane become CP edges, and their uncertainty."""
 
-    station_m: float = 4.0  # between two of a lane's landmarks
+    station_m: float = 4.0  # distance between the landmarks of a lane
     least_points: int = 8  # of a station
     sigma_px: float = 1.0  # of the markings' mask
     sigma_across_m: float = 0.1  # across the marking: half of a painted line's width
     sigma_along_m: float = 10.0  # along the lane: unknown
-    bend_m: float = 0.25  # of a station's points about their line, at the most
-    max_edges: int = 16  # of a frame, the nearest
-    # One frame's stations are repeated in this many more, moved by the odometry, since a segmenter that does not run on
-    # each frame need not run on the graph's keyframes. Fewer than lie between two of those, so that none counts twice
+    bend_m: float = 0.25  # max. deviation of a station's points from their line
+    max_edges: int = 16  # per frame, the nearest
+    # A frame's stations are repeated in this many later frames, since the segmenter need not run on keyframes. It is
+    # less than the keyframe interval, so that none counts twice.
     carried_frames: int = 3
 
 
 @dataclass(frozen=True)
 class Station:
-    """A station seen by one frame: its landmark's id, its position (2,) in world and the covariance (2, 2) of that."""
+    """A station seen by one frame: its landmark's id, its position (2,) in world and covariance (2, 2)."""
 
     landmark: int
     point_m: Floats
     cov: Floats
 
     def edge(self, frame_id: int, T_world_ego: SE2) -> LandmarkEdge:
-        """The CP edge of a frame in which the ego is at `T_world_ego`."""
+        """The CP edge of frame `frame_id` with the ego at `T_world_ego`."""
         x_m, y_m = (T_world_ego.inverse() @ self.point_m).tolist()
         R = T_world_ego.rotation()
         cov = tuple((R.T @ self.cov @ R).ravel().tolist())
@@ -57,10 +57,10 @@ class Station:
         )
 
 
-def stations(points_m: Floats, lanes: Ids, config: LaneEdgesConfig) -> list[tuple[int, Floats, Floats]]:
-    """(landmark, point (2,), direction (2,)) of points (N, 2) in world, each known to be on a lane of `lanes` (N,).
+def fit_stations(points_m: Floats, lanes: Ids, config: LaneEdgesConfig) -> list[tuple[int, Floats, Floats]]:
+    """(landmark, point (2,), direction (2,)) from points (N, 2) in world and their lanes (N,).
 
-    Stations lie on lines of constant x or y, whichever the lane crosses more squarely.
+    Stations lie on lines of constant x or y, whichever is closer to perpendicular to the lane.
     """
     found = []
     for lane in np.unique(lanes[lanes >= 0]).tolist():
@@ -71,10 +71,10 @@ def stations(points_m: Floats, lanes: Ids, config: LaneEdgesConfig) -> list[tupl
         for cell in np.unique(cells).tolist():
             along, across = points[cells == cell][:, [axis, 1 - axis]].T
             middle_m = (cell + 0.5) * config.station_m
-            if len(along) < config.least_points or np.ptp(along) < _MIN_SPAN * config.station_m:
+            if len(along) < config.least_points or np.ptp(along) < _MIN_SPAN_RATIO * config.station_m:
                 continue
             gap_m = along - along.mean()
-            slope = float(gap_m @ across) / float(gap_m @ gap_m)  # numpy.polyfit takes ten times as long
+            slope = float(gap_m @ across) / float(gap_m @ gap_m)  # numpy.polyfit is slower
             at_m = float(across.mean()) + slope * (middle_m - float(along.mean()))
             if np.std(across - slope * gap_m) > config.bend_m:
                 continue
@@ -94,10 +94,11 @@ def lane_stations(
     sigma_height_rel: float,
     config: LaneEdgesConfig,
 ) -> list[Station]:
-    """The stations that one frame saw, nearest first; `points_m` (N, 2) in world, the rest is of that frame."""
+    """The stations seen by one frame, nearest first; `points_m` (N, 2) in world, the rest is of that frame."""
     T_ego_world = T_world_ego.inverse()
     seen = [
-        (T_ego_world @ point, landmark, point, along) for landmark, point, along in stations(points_m, lanes, config)
+        (T_ego_world @ point, landmark, point, along)
+        for landmark, point, along in fit_stations(points_m, lanes, config)
     ]
     seen = sorted((s for s in seen if s[0][0] > 0.0), key=lambda s: float(s[0][0]))[: config.max_edges]
     if not seen:

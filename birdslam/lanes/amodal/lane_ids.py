@@ -11,7 +11,7 @@ from birdslam.geometry.se2 import SE2
 
 Ids = Ints
 
-NO_LANE = -1  # of a point that lies on no known lane
+NO_LANE = -1  # id of a point on no known lane
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,8 @@ class LaneIds:
     """
 
     def __init__(self, same_lane_m: float, cell_m: float, remembered_m: float) -> None:
-        """A lane seen again lies within `same_lane_m` of its points; beyond `remembered_m` these are dropped."""
-        from scipy.spatial import cKDTree  # here: it takes half a second, and only one process maps lanes
+        """`same_lane_m`: max. distance of a lane from its points; `remembered_m`: radius of stored points."""
+        from scipy.spatial import cKDTree  # slow import, needed in one process only
 
         self._tree = cKDTree
         self._same_lane_m, self._cell_m, self._memory_m = same_lane_m, cell_m, remembered_m
@@ -44,7 +44,7 @@ class LaneIds:
         self.clear()
 
     def clear(self) -> None:
-        """Drops all lanes; ids go on counting."""
+        """Drops all lanes; ids are not reused."""
         self._points = np.zeros((0, 2))  # in world
         self._lanes = np.zeros(0, dtype=np.int64)
         self._kd_tree = self._tree(self._points)
@@ -59,7 +59,7 @@ class LaneIds:
         return out
 
     def assign(self, T_world_ego: SE2, clouds: list[Floats]) -> tuple[LaneCloud, ...]:
-        """Clouds (N, 2) in ego, each with an id of its own."""
+        """Assigns an id to each cloud (N, 2) in ego; each lane gets at most one cloud."""
         in_world = [T_world_ego @ cloud for cloud in clouds]
         votes: list[tuple[int, int, int]] = []  # (how many points, the cloud, the lane)
         if len(self._points):
@@ -78,7 +78,7 @@ class LaneIds:
         return tuple(LaneCloud(lane_of[k], cloud) for k, cloud in enumerate(clouds))
 
     def _store(self, T_world_ego: SE2, clouds: list[Floats], lanes: list[int]) -> None:
-        """Adds the clouds' points; of the points in a cell of `cell_m` the newest is kept."""
+        """Adds the clouds' points; each cell of `cell_m` keeps the newest point."""
         points = np.concatenate([*clouds, self._points]) if clouds else self._points
         ids = np.concatenate([np.repeat(lanes, [len(c) for c in clouds]), self._lanes]) if clouds else self._lanes
         near = np.linalg.norm(points - [T_world_ego.x_m, T_world_ego.y_m], axis=1) < self._memory_m

@@ -1,6 +1,6 @@
 """Lanes in the front end: lane points and CP edges from each segmentation (paper, Sec. 3.2).
 
-Detecting lanes takes longer than a frame, so that it runs in the background where it can, and at its own rate.
+Detection takes longer than a frame, so it runs at its own rate and, if possible, in the background.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ from birdslam.types import LandmarkEdge, LanePoint, Lanes, Status
 Ids = Ints
 Submit = Callable[..., Future[Any]]  # (function, *arguments), as of an executor
 
-REMEMBERED_FRAMES = 64  # whose poses are kept for late segmentations
-REMEMBERED_IMAGES = 8  # ... and whose images: lines are looked for in the image of a segmentation
+MAX_FRAMES = 64  # number of stored poses, for late segmentations
+MAX_IMAGES = 8  # number of stored images: lines are detected in the image of a segmentation
 
 
 @dataclass(frozen=True)
 class LaneHead:
-    """How lanes are detected, and how often: perceive's schedule has them beside the networks' heads.
+    """How and how often lanes are detected.
 
-    `complete` is the network that completes the grids where something occluded the road; None: not completed. `submit`
-    runs a function in the background; None: within the frame. Lanes are detected after `every` frames, times
-    `slowdown()`, which a busy computer raises. Between its parts of two milliseconds or so the detection calls
-    `yield_core`: in the background it waits there for the frames, which need the same interpreter.
+    `complete`: network that completes occluded parts of the grids, or None. `submit` runs a function in the
+    background; None: within the frame. Lanes are detected every `every * slowdown()` frames; the latter is above 1 on a
+    busy computer. Detection in the background calls `yield_core` about every 2 ms, since frames need the same
+    interpreter.
     """
 
     complete: Completion | None = None
@@ -56,7 +56,7 @@ class LaneHead:
 
 @dataclass(frozen=True)
 class LaneOutput:
-    """A frame's lane points and edges, in its ego. `age`: frames since lanes were last detected; None: never yet."""
+    """Lane points and edges of a frame in its ego. `age`: frames since the last detection, None before the first."""
 
     points: tuple[LanePoint, ...] = ()
     edges: tuple[LandmarkEdge, ...] = ()
@@ -67,20 +67,20 @@ class LaneOutput:
 
 @dataclass(frozen=True)
 class _LaneResult:
-    """A run's result, in world: points (N, 2), their lanes (N,), and stations."""
+    """Result of a run in world: points (N, 2), their lanes (N,), and stations."""
 
     points_m: Floats
     lanes: Ids
     stations: list[Station]
-    with_lanes: bool  # lanes of many frames were detected too, not only this frame's points
-    failed: bool  # the completion network gave no usable numbers
-    lines: TrackedLines | None  # None: not looked for, or the image of the segmentation is no more at hand
+    with_lanes: bool  # lanes were detected from many frames, not only this frame's points
+    failed: bool  # the output of the completion network was not finite
+    lines: TrackedLines | None  # None: not due, or the image of the segmentation is not stored any more
     seen_ns: int  # source time of that image
 
 
 @dataclass(frozen=True)
 class _PastFrame:
-    """An earlier frame's pose and ground, for the back-projection of its segmentation."""
+    """Pose and ground of an earlier frame, for the back-projection of its segmentation."""
 
     frame_id: int
     T_world_ego: SE2
@@ -96,14 +96,12 @@ def _run_now(run: Callable[..., Any], *arguments: Any) -> Future[Any]:
 
 
 class LaneMapper:
-    """Lane points and lane edges of each segmentation, once, in the ego of the frame at hand.
+    """Lane points and edges of each segmentation in the ego of the current frame.
 
-    A segmentation may come frames after its image; it is back-projected with the pose and the ground plane of its own
-    frame. Every `LaneHead.every` frames the lanes of many segmentations are detected (`lanes.AmodalLanes`); points of
-    this one on no known lane are lane points without an id.
-
-    With `LaneHead.submit` the result comes with a later frame, and a segmentation that comes meanwhile is skipped, with
-    the status LANES_CARRIED if lanes were due.
+    A segmentation may be some frames late; it is back-projected with the pose and ground of its own frame. Every
+    `LaneHead.every` frames `lanes.AmodalLanes` detects the lanes of many segmentations; points of this one on no known
+    lane become lane points without an id. With `LaneHead.submit` the result comes with a later frame; segmentations in
+    between are skipped, with the status LANES_CARRIED if lanes were due.
     """
 
     def __init__(
@@ -121,20 +119,20 @@ class LaneMapper:
         self._submit = head.submit or _run_now
         self._amodal = AmodalLanes(lanes, head.complete, head.yield_core)
         self._tracker, self._ego_lane = LineTracker(camera, yield_core=head.yield_core), EgoLane()
-        self._lines: tuple[int, TrackedLines] | None = None  # and the source time of their image
-        self._frames: deque[_PastFrame] = deque(maxlen=REMEMBERED_FRAMES)
-        self._images: deque[tuple[int, NDArray[np.uint8]]] = deque(maxlen=REMEMBERED_IMAGES)
+        self._lines: tuple[int, TrackedLines] | None = None  # (source time of their image, lines)
+        self._frames: deque[_PastFrame] = deque(maxlen=MAX_FRAMES)
+        self._images: deque[tuple[int, NDArray[np.uint8]]] = deque(maxlen=MAX_IMAGES)
         self._used_frame = -1
         self._run: Future[_LaneResult] | None = None
         self._run_frame = -1
-        self._run_outdated = False  # the run under way belongs to an earlier epoch
-        self._way_lost = False  # since the last run
-        self._lanes_due_frame: int | None = None  # of the last run that detects lanes
-        self._lanes_frame: int | None = None  # of the last run that has detected lanes
-        self._stations: tuple[int, list[Station]] = (-1, [])  # and the frame that saw them
+        self._run_outdated = False  # the current run belongs to an earlier epoch
+        self._position_lost = False  # since the last run
+        self._lanes_due_frame: int | None = None  # frame of the last run that detects lanes
+        self._lanes_frame: int | None = None  # frame of the last finished one
+        self._stations: tuple[int, list[Station]] = (-1, [])  # (frame, stations)
 
     def clear(self) -> None:
-        """The world frame restarted."""
+        """Drops all lanes after a restart of the world frame."""
         self._frames.clear()
         self._lanes_due_frame = self._lanes_frame = None
         self._stations = (-1, [])
@@ -142,26 +140,23 @@ class LaneMapper:
         self._ego_lane.clear()
         self._run_outdated = self._run is not None
         if not self._run_outdated:
-            self._forget()
+            self._clear_maps()
 
     def forget_position(self) -> None:
-        """The way to this frame is not known in metres: what was seen before it has no metric position.
+        """The motion to this frame has no scale: restarts with the next segmentation."""
+        self._position_lost = True
 
-        The next segmentation restarts, as a single image does.
-        """
-        self._way_lost = True
-
-    def _forget(self) -> None:
+    def _clear_maps(self) -> None:
         self._amodal.clear()
         self._tracker.clear()
 
     @property
     def vertical(self) -> VerticalCurvature | None:
-        """Of the road ahead, as lines were last seen."""
+        """Vertical curvature of the road ahead from the last lines."""
         return None if self._lines is None else self._lines[1].vertical
 
     def view(self, T_world_ego: SE2) -> LaneView:
-        """The grids and lanes around the ego, for a picture; not while a run is under way."""
+        """The grids and lanes around the ego, for a picture; not during a run in the background."""
         return lane_view(self._amodal, T_world_ego)
 
     def map_lanes(
@@ -179,9 +174,9 @@ class LaneMapper:
     ) -> LaneOutput:
         """Lane points and edges of the segmentation of `segmented_frame`, if it is new and the ego has moved.
 
-        `sigma_tilt_rad` are those of the pitch and the roll of `ground`. `boxes_px` (N, 4) are the vehicles' latest
-        boxes, within which nothing is used, and `bonnet_px` (N, 2) the edge of the car's own bonnet. Lines are found
-        in the images, (H, W) grey or (H, W, 3) BGR, of which this frame's is kept for its segmentation.
+        `sigma_tilt_rad`: 1-sigma of the pitch and roll of `ground`. `boxes_px` (N, 4): the vehicles' latest boxes,
+        which are masked out. `bonnet_px` (N, 2): edge of the ego's bonnet. `image`: (H, W) grey or (H, W, 3) BGR, kept
+        until its segmentation comes.
         """
         self._frames.append(_PastFrame(frame_id, T_world_ego, ground, sigma_tilt_rad, t_source_ns))
         if image is not None:
@@ -201,14 +196,23 @@ class LaneMapper:
                     self._run_frame = frame_id
                     seen = next((kept for kept_id, kept in self._images if kept_id == segmented_frame), None)
                     road = segmentation if bonnet_px is None else segmentation.above(bonnet_px)
-                    run = (T_world_ego, then, road, boxes_px, bonnet_px, due, seen if due else None, self._way_lost)
-                    self._way_lost = False
+                    run = (
+                        T_world_ego,
+                        then,
+                        road,
+                        boxes_px,
+                        bonnet_px,
+                        due,
+                        seen if due else None,
+                        self._position_lost,
+                    )
+                    self._position_lost = False
                     self._run = self._submit(self._detect_lanes, *run)
         found = earlier or self._take_result()
         return self._output(found, frame_id, T_world_ego, status, self._lanes_at(T_world_ego, t_source_ns))
 
     def _lanes_at(self, T_world_ego: SE2, t_source_ns: int) -> Lanes | None:
-        """The lanes by the lines as they were last seen, predicted by the ego's motion since; None before the first."""
+        """The lanes between the last lines, predicted by the ego's motion since; None before the first."""
         if self._lines is None:
             return None
         seen_ns, lines = self._lines
@@ -216,13 +220,13 @@ class LaneMapper:
         return self._ego_lane.lanes(lines.at(T_world_ego), age_ns, lines.tilt, lines.road_from_m)
 
     def _take_result(self) -> _LaneResult | None:
-        """The result of a run that has ended."""
+        """The result of a finished run."""
         if self._run is None or not self._run.done():
             return None
         found, self._run = self._run.result(), None
         if self._run_outdated:
             self._run_outdated = False
-            self._forget()
+            self._clear_maps()
             return None
         self._stations = self._run_frame, found.stations
         if found.lines is not None:
@@ -263,10 +267,10 @@ class LaneMapper:
         bonnet_px: Floats | None,
         due: bool,
         image: NDArray[np.uint8] | None,
-        again: bool,
+        restart: bool,
     ) -> _LaneResult:
-        if again:
-            self._forget()
+        if restart:
+            self._clear_maps()
         lines = None
         if image is not None:
             self._tracker.update(
@@ -309,9 +313,9 @@ class LaneMapper:
         return _LaneResult(points_m, all_lanes, found, due, failed, lines, then.t_source_ns)
 
     def _lanes_m(self, T_world_ego: SE2) -> tuple[Floats, Ids]:
-        """(N, 2) points, in world, of the lanes ahead, and their lanes (N,): the mean of each cell.
+        """(N, 2) points of the lanes ahead in world, the mean of each cell, and their lanes (N,).
 
-        Too many points are thinned evenly.
+        Above `max_lane_points` they are thinned evenly.
         """
         config = self.config
         clouds = self._amodal.lanes(T_world_ego)
@@ -332,7 +336,7 @@ class LaneMapper:
         return T_world_ego @ points[kept], lanes[kept]
 
     def _points_m(self, segmentation: Segmentation, ground: GroundPlane, boxes_px: Floats) -> Floats:
-        """(N, 2) in the ego of the segmentation's frame, one for each cell, nearest first."""
+        """(N, 2) lane points in the ego of the segmentation's frame, one per cell, nearest first."""
         config = self.config
         lane = segmentation.lane.copy()
         for x1, y1, x2, y2 in boxes_px:

@@ -1,8 +1,7 @@
-"""Amodal lanes (paper, Sec. 3.2): the road seen by many frames, completed where something occluded it.
+"""Amodal lanes (paper, Sec. 3.2): the road accumulated over many frames and completed where it was occluded.
 
-Near points of road and lane boundaries, accumulated over a window of frames with the odometry, fill two occupancy grids
-in the newest ego frame. Isolated cells are dropped, a network (ENet) completes the grids, opening and closing clean
-them, and the Hough transform segregates the boundary's cells into lanes with persistent ids (`AmodalLanes.lanes`).
+Points of road and lane boundaries fill two occupancy grids in the newest ego frame; a network (ENet) completes them,
+and the Hough transform segregates the boundary's cells into lanes with persistent ids.
 A grid is (rows, columns) over x (row 0: `behind_m` behind the ego) and y (column 0: `half_width_m` to the right).
 """
 
@@ -34,31 +33,31 @@ ROAD, BOUNDARY = 0, 1  # the channels of a pair of grids
 class LanesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The grids of Sec. 3.2 and the extraction of lanes from them."""
 
-    window_frames: int = 45  # segmented frames; the paper has 40 to 50
-    step_m: float = 0.4  # travelled between two of them, whatever the frame rate
-    step_rad: float = 0.05  # or turned
-    depth_m: float = 15.0  # of the points; within the paper's 5 m a car's camera does not see the road
-    lattice_m: float = 0.1  # sampling sideways: finer than a painted line
+    window_frames: int = 45  # segmented frames; 40 to 50 in the paper
+    step_m: float = 0.4  # distance travelled between two of them
+    step_rad: float = 0.05  # or rotation
+    depth_m: float = 15.0  # max. distance of the points; a car's camera does not see the paper's 5 m
+    lattice_m: float = 0.1  # lateral sampling, finer than a painted line
     behind_m: float = 8.0  # of the grid
     ahead_m: float = 24.0  # of the grid
     half_width_m: float = 16.0  # of the grid
     cell_m: float = 0.25  # side of a cell
     full_count: int = 2  # observations of a fully occupied cell
     neighbourhood_cells: int = 3  # m of the m x m cells around a cell
-    neighbourhood_least: int = 3  # foreground cells among m x m, the cell itself included
-    least_occupancy: float = 0.5  # of a completed cell
+    neighbourhood_least: int = 3  # min. foreground cells among m x m, itself included
+    least_occupancy: float = 0.5  # min. occupancy of a completed cell
     # Hough
-    line_votes: int = 10  # of the Hough transform: cells on a line
+    line_votes: int = 10  # min. cells on a line (Hough transform)
     line_least_m: float = 2.0  # shorter pieces are dropped
-    line_gap_m: float = 4.0  # of a dashed line
-    same_line_rad: float = 0.2  # angle between pieces of one lane
-    bend_rad: float = 0.6  # angle between adjacent pieces of one lane
-    same_line_m: float = 0.5  # distance of a piece from the other's line
-    cell_reach_m: float = 1.0  # of a cell from its nearest piece
-    least_cells: int = 8  # of a lane, and of its part that was seen: a lane that no frame saw is a guess
+    line_gap_m: float = 4.0  # max. gap of a dashed line
+    same_line_rad: float = 0.2  # max. angle between pieces of one lane
+    bend_rad: float = 0.6  # max. angle between adjacent pieces of one lane
+    same_line_m: float = 0.5  # max. distance of a piece from the other's line
+    cell_reach_m: float = 1.0  # max. distance of a cell from its nearest piece
+    least_cells: int = 8  # min. of a lane, and of its part that frames saw
     # Ids
-    same_lane_m: float = 0.75  # distance of a lane from its known points
-    remembered_m: float = 40.0  # radius around the ego in which lanes are known
+    same_lane_m: float = 0.75  # max. distance of a lane from its known points
+    remembered_m: float = 40.0  # radius around the ego in which lanes are stored
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -67,13 +66,13 @@ class LanesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Completion(Protocol):
-    """The network that completes a pair of grids: (2, rows, columns) of 0..1 in, the same out."""
+    """A network that completes a pair of grids: (2, rows, columns) of 0..1 to the same."""
 
     def __call__(self, grids: Grids) -> Grids: ...
 
 
 class AmodalLanes:
-    """`add` for each segmented frame, then `lanes` in the ego of any later pose. Deterministic."""
+    """`add` each segmented frame, then call `lanes` for any later ego pose. Deterministic."""
 
     def __init__(
         self, config: LanesConfig, complete: Completion | None = None, yield_core: Callable[[], object] = lambda: None
@@ -82,7 +81,7 @@ class AmodalLanes:
         self.config = config
         self.complete = complete
         self._yield_core = yield_core
-        self.completion_failed = False  # in the last run: its output was not finite and not used
+        self.completion_failed = False  # in the last run: its output was not finite and is not used
         self._frames: deque[tuple[SE2, tuple[Points, Points]]] = deque(maxlen=config.window_frames)
         self.ids = LaneIds(config.same_lane_m, config.cell_m, config.remembered_m)
 
@@ -100,7 +99,7 @@ class AmodalLanes:
         self._frames.append((T_world_ego, (road, boundary)))
 
     def clear(self) -> None:
-        """The world frame restarted: points and lanes are dropped."""
+        """Drops points and lanes after a restart of the world frame."""
         self._frames.clear()
         self.ids.clear()
 
@@ -113,7 +112,7 @@ class AmodalLanes:
         self.completion_failed = completed is not None and not np.isfinite(completed).all()
         if completed is None or self.completion_failed:
             return self.ids.assign(T_world_ego, segregate(grids, self.config))
-        clouds = segregate(np.maximum(grids, completed), self.config)  # what was seen stays
+        clouds = segregate(np.maximum(grids, completed), self.config)  # completion only adds
         seen = cv2.dilate(grids[BOUNDARY], np.ones((5, 5), dtype=np.uint8)) > 0.0
         known = [cloud for cloud in clouds if np.sum(seen[_cells_of(cloud, self.config)]) >= self.config.least_cells]
         return self.ids.assign(T_world_ego, known)
@@ -136,16 +135,16 @@ class AmodalLanes:
 
 @dataclass(frozen=True)
 class LaneView:
-    """The grids and lanes around one ego pose, for a picture (paper, Fig. 4). Grids (2, rows, columns) of 0..1."""
+    """The grids and lanes around one ego pose, for a picture (paper, Fig. 4). Grids: (2, rows, columns) of 0..1."""
 
     seen: Grids
-    completed: Grids  # what was seen, and what the network added; without one the same as `seen`
-    lanes_seen: list[Floats]  # clouds (N, 2) in ego, without the network
-    lanes: list[Floats]  # with it: the amodal lanes
+    completed: Grids  # `seen` and what the network added
+    lanes_seen: list[Floats]  # clouds (N, 2) in ego without the network
+    lanes: list[Floats]  # with the network: the amodal lanes
 
 
 def lane_view(amodal: AmodalLanes, T_world_ego: SE2) -> LaneView:
-    """The steps of `AmodalLanes.lanes`, each kept. Changes nothing: no lane gets an id."""
+    """The intermediate results of `AmodalLanes.lanes`. Changes no state: no lane gets an id."""
     seen = amodal.grids(T_world_ego)
     added = seen if amodal.complete is None else amodal.complete(seen)
     completed = np.maximum(seen, added) if np.isfinite(added).all() else seen
@@ -157,14 +156,14 @@ def points_of(
 ) -> tuple[Floats, Floats]:
     """Points of road (N, 2) and of lane boundaries (M, 2) in the ego of the segmentation's frame, up to `depth_m`.
 
-    The masks are sampled at a regular grid on the road (the inverse of Eq. 1), so that near and far road have the same
-    density. What `boxes_px` (B, 4) cover is left out: vehicles occlude the road there.
+    The masks are sampled on a regular grid on the road (the inverse of Eq. 1), for a uniform density. Pixels in
+    `boxes_px` (B, 4) are left out, since vehicles occlude the road.
     """
     x_m, y_m = _road_grid(config)
-    # As bev.ego_to_pixel, but of a grid each camera coordinate is a sum of a row's and a column's part
-    ahead, submit, up = ground.R_ego_cam
+    # bev.ego_to_pixel for a grid: each camera coordinate is a sum of a row's and a column's part
+    ahead, left, up = ground.R_ego_cam
     right, down, depth = (
-        (a * x_m - c * ground.height_m)[:, None] + b * y_m for a, b, c in zip(ahead, submit, up, strict=True)
+        (a * x_m - c * ground.height_m)[:, None] + b * y_m for a, b, c in zip(ahead, left, up, strict=True)
     )
     with np.errstate(divide="ignore", invalid="ignore"):
         u = camera.fx_px * (right / depth) + camera.cx_px
@@ -189,7 +188,7 @@ def without_boxes(mask: Bools, boxes_px: Floats) -> Bools:
 
 @functools.lru_cache(maxsize=4)
 def _road_grid(config: LanesConfig) -> tuple[Floats, Floats]:
-    """x (N,) of the rows and y (M,) of the columns of the points of the road at which masks are sampled."""
+    """x (N,) of the rows and y (M,) of the columns at which masks are sampled."""
     x_m = np.arange(0.5 * config.cell_m, config.depth_m, config.cell_m)
     y_m = np.arange(-config.half_width_m, config.half_width_m, config.lattice_m)
     return x_m, y_m
@@ -197,7 +196,7 @@ def _road_grid(config: LanesConfig) -> tuple[Floats, Floats]:
 
 def in_cells(points_m: Points, T_ego_then: SE2, config: LanesConfig) -> Points:
     """Points of an earlier ego frame as fractional (row, column) of the grid."""
-    if not len(points_m):  # OpenCV transforms at least one
+    if not len(points_m):  # cv2.transform rejects empty arrays
         return points_m
     origin_m = _origin_m(config) + np.array([T_ego_then.x_m, T_ego_then.y_m])
     to_cells = np.column_stack([T_ego_then.rotation(), origin_m]) / config.cell_m
@@ -240,9 +239,9 @@ def cell_centres_m(cells: Bools, config: LanesConfig) -> Floats:
 def segregate(grids: Grids, config: LanesConfig) -> list[Floats]:
     """The boundary's cells as one cloud (N, 2) in ego for each lane, from right to left.
 
-    Opening the road removes specks, closing it fills holes; a boundary lies on the road or beside it. The boundary's
-    lines are one cell wide, so they are closed and not opened: `dense` has removed their specks. Line segments of the
-    Hough transform that continue each other are one lane, straight or bent.
+    Opening the road removes specks, closing fills holes; a boundary lies on the road or beside it. Boundary lines are
+    one cell wide, so they are closed only: `dense` has removed their specks. Line segments of the Hough transform that
+    continue each other are one lane, straight or curved.
     """
     kernel = np.ones((3, 3), dtype=np.uint8)
     road, boundary = (np.asarray(grid >= config.least_occupancy).astype(np.uint8) for grid in grids)
@@ -253,8 +252,8 @@ def segregate(grids: Grids, config: LanesConfig) -> list[Floats]:
     cells = cell_centres_m(on_road, config)
     if not len(pieces) or not len(cells):
         return []
-    along, submit = _along_and_aside_m(pieces, cells)
-    distance = np.hypot(submit, np.maximum(np.abs(along) - 0.5 * _lengths_m(pieces), 0.0))  # (cells, pieces)
+    along, aside_m = _along_and_aside_m(pieces, cells)
+    distance = np.hypot(aside_m, np.maximum(np.abs(along) - 0.5 * _lengths_m(pieces), 0.0))  # (cells, pieces)
     piece = np.where(distance.min(axis=1) < config.cell_reach_m, distance.argmin(axis=1), -1)
     lane_of_piece = _merge_pieces(pieces, _adjacent(piece, on_road, len(pieces)), config)
     lane = np.where(piece >= 0, lane_of_piece[piece], -1)
@@ -281,7 +280,7 @@ def _line_pieces_m(boundary: Bools, config: LanesConfig) -> Floats:
 
 
 def _along_and_aside_m(pieces: Floats, points: Floats) -> tuple[Floats, Floats]:
-    """(N, P) each: points (N, 2) relative to segments (P, 2, 2), along from the middle, and across."""
+    """(N, P) each: points (N, 2) relative to the middles of segments (P, 2, 2), along and across."""
     direction = pieces[:, 1] - pieces[:, 0]
     direction = direction / np.maximum(np.linalg.norm(direction, axis=1), 1e-9)[:, None]
     gap = points[:, None, :] - pieces.mean(axis=1)[None]
@@ -294,7 +293,7 @@ def _lengths_m(pieces: Floats) -> Floats:
 
 
 def _adjacent(piece: Ints, cells: Bools, count: int) -> Bools:
-    """(P, P) which segments have adjacent cells; `piece` is the segment of each cell that is set, or -1."""
+    """(P, P) whether two segments have adjacent cells; `piece` is the segment of each set cell, or -1."""
     grid = np.full(np.add(cells.shape, 2), -1)
     grid[1:-1, 1:-1][cells] = piece
     out = np.zeros((count, count), dtype=np.bool_)
@@ -307,17 +306,17 @@ def _adjacent(piece: Ints, cells: Bools, count: int) -> Bools:
 
 
 def _merge_pieces(pieces: Floats, adjacent: Bools, config: LanesConfig) -> Ints:
-    """(P,) the lane of each segment: segments are joined if adjacent in a bend, or if one ends on the other's line.
+    """(P,) the lane of each segment. Joins adjacent segments of a curve, and a segment that ends on the other's line.
 
-    Beyond the other's end up to a dashed line's gap. A stop line is adjacent too, but at too large an angle.
+    The gap along the line may be that of a dashed line. The limit of the angle keeps stop lines apart.
     """
     count = len(pieces)
     vector = pieces[:, 1] - pieces[:, 0]
     yaw = np.arctan2(vector[:, 1], vector[:, 0])
     turn = np.abs((yaw[:, None] - yaw[None] + 0.5 * math.pi) % math.pi - 0.5 * math.pi)
-    along, submit = _along_and_aside_m(pieces, pieces.reshape(-1, 2))
+    along, aside_m = _along_and_aside_m(pieces, pieces.reshape(-1, 2))
     past = np.abs(along) - 0.5 * _lengths_m(pieces)
-    meets = (np.abs(submit) < config.same_line_m) & (past < config.line_gap_m)
+    meets = (np.abs(aside_m) < config.same_line_m) & (past < config.line_gap_m)
     joined = meets.reshape(count, 2, count).any(axis=1) & (turn < config.same_line_rad)
     joined |= adjacent & (turn < config.bend_rad)
     from scipy.sparse import coo_array  # loaded by lane_ids.py's import of scipy.spatial
