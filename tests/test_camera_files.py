@@ -123,7 +123,7 @@ def test_opencvs_models_of_distortion_reach_the_camera(tmp_path: Path, count: in
     [
         ("a.yaml", KALIBR.replace("pinhole", "omni"), "camera_model omni is not supported"),
         ("a.yaml", KALIBR.replace("radtan", "fov"), "distortion_model fov is not supported"),
-        ("a.yaml", KALIBR + KALIBR.replace("cam0", "cam1"), "has 2 cameras; leave one"),
+        ("a.yaml", KALIBR + KALIBR.replace("cam0", "cam1"), "has 2 cameras; keep one"),
         ("a.yaml", KALIBR.replace("438.5, ", ""), "3 numbers, not 4"),
         ("a.yaml", ORB_SLAM3.replace("PinHole", "Mei"), "Camera.type Mei is not supported"),
         ("a.yaml", ORB_SLAM3.replace("Camera1.cy", "Camera1.cz"), "lacks one of Camera1.fx"),
@@ -131,9 +131,9 @@ def test_opencvs_models_of_distortion_reach_the_camera(tmp_path: Path, count: in
         ("a.txt", COLMAP.replace(" 0.0005", ""), "OPENCV has 7 parameters, not 8"),
         ("a.txt", COLMAP + "2 PINHOLE 640 480 400 400 320 240\n", "2 different cameras"),
         ("a.json", NUSCENES.replace('"camera_intrinsic": []', '"camera_intrinsic": [[1, 0, 2]]'), "2 different"),
-        ("a.json", ROS_JSON.replace("438.5, 0, 305.5, 0, 437.25, 243.75, 0, 0, 1", "0,0,0,0,0,0,0,0,0"), "never calib"),
+        ("a.json", ROS_JSON.replace("438.5, 0, 305.5, 0, 437.25, 243.75, 0, 0, 1", "0,0,0,0,0,0,0,0,0"), "not calib"),
         ("a.json", ROS_JSON.replace("0.0005]", "0.0005, 0, 0]"), "6 distortion coefficients"),
-        ("a.xml", XML.replace("</opencv_storage>", "<"), "no OpenCV storage"),
+        ("a.xml", XML.replace("</opencv_storage>", "<"), "not an OpenCV storage"),
         ("a.txt", "a film\n", "expected a file of KITTI, ROS"),
     ],
 )

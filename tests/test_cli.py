@@ -99,7 +99,7 @@ def test_a_model_needs_a_role() -> None:
     [
         (["run"], "no source"),
         (["run", "--source", NOWHERE], "/nowhere/at/all: no such directory"),
-        (["run", "--source", "radar:1"], "radar:1: no such source 'radar:'; there are demo"),
+        (["run", "--source", "radar:1"], "radar:1: unknown source 'radar:'; choose from demo"),
         (["run", "missing.toml"], "missing.toml: No such file"),
         (["run", "--source", NOWHERE, "--rate", "fast"], "source.rate"),
         (["run", "--source", NOWHERE, "--set", "slam.colour=1"], "slam.colour: no such key"),

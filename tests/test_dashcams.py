@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from birdslam.calibration.lens import Lens, self_calibrate
-from birdslam.calibration.lens_windows import CornersOfImage, followed_corners
+from birdslam.calibration.lens_windows import CornersOfImage, track_corners
 from birdslam.calibration.readout import USUAL
 from birdslam.geometry.camera import Undistorter
 from birdslam.odometry.odometry import Odometry
@@ -39,7 +39,7 @@ def images_of(name: str) -> list[np.ndarray]:
 def lens_of(name: str, prior: float) -> tuple[Lens | None, float]:
     """What the film shows with a focal length beforehand that is off by a factor; and the error of the found one."""
     camera = load_camera(FILMS / f"{name}.toml")
-    corners = followed_corners(((image, NO_BOXES, 0.1 * k) for k, image in enumerate(images_of(name))), camera)
+    corners = track_corners(((image, NO_BOXES, 0.1 * k) for k, image in enumerate(images_of(name))), camera)
     some = [CornersOfImage(each.ids, each.px) for each in corners]
     lens = self_calibrate(some, (camera.width_px, camera.height_px), prior * camera.fx_px, PRIOR_SIGMA)
     return lens, 0.0 if lens is None else math.log(lens.focal_px / camera.fx_px)

@@ -260,19 +260,19 @@ def test_boxes_inside_lie_in_the_image(corners: list[tuple[float, float, float, 
     [
         ("1,5,10,20,30,40,0.9\n1,5,10,20,thirty,40,0.9\n", "line 2"),
         ("1,5,10,20,30,40,0.9\n2,5,10,20\n", "line 2: has 4 columns"),
-        ("0,5,10,20,30,40,0.9\n", "frames begin at 1"),
-        ("1,5,10,20,-30,40,0.9\n", "line 1: its width"),
+        ("0,5,10,20,30,40,0.9\n", "frames start at 1"),
+        ("1,5,10,20,-30,40,0.9\n", "line 1: width"),
         ("1,5,10,20,nan,40,0.9\n", "line 1: needs finite"),
-        ("1.5,5,10,20,30,40,0.9\n", "line 1: '1.5' is no whole number"),
+        ("1.5,5,10,20,30,40,0.9\n", "line 1: '1.5' is not a whole number"),
         ("1,5,10,20,30,40,0.9\n1,5,50,20,30,40,0.9\n", "line 1 to line 2: track_ids"),
         ("0 5 Car 0 0 -10 10 20 40\n", "line 1: has 9 columns"),
-        ("0 5 Car 0 0 0 1 2 3 4\n0 6 car 0 0 0 5 2 9 4\n", "line 2: type car is none of Car, Van"),
-        ('[{"image_id": 0, "category_id": 95, "bbox": [1, 2, 3, 4], "score": 1}]', "neither COCO's 1 to 90"),
-        ("", "holds no boxes"),
-        ("[{]", "is no JSON"),
+        ("0 5 Car 0 0 0 1 2 3 4\n0 6 car 0 0 0 5 2 9 4\n", "line 2: type car is not one of Car, Van"),
+        ('[{"image_id": 0, "category_id": 95, "bbox": [1, 2, 3, 4], "score": 1}]', "neither in COCO's 1 to 90"),
+        ("", "no boxes"),
+        ("[{]", "not JSON"),
         ('{"images": []}', "are a list"),
-        ('[{"image_id": 0, "category_id": 3}]', "entry 0 is no box"),
-        ('[{"image_id": 0, "category_id": 3, "bbox": [1, 2, 3], "score": 1}]', "entry 0 is no box"),
+        ('[{"image_id": 0, "category_id": 3}]', "entry 0 is not a box"),
+        ('[{"image_id": 0, "category_id": 3, "bbox": [1, 2, 3], "score": 1}]', "entry 0 is not a box"),
     ],
 )
 def test_a_file_that_is_none_names_its_first_wrong_line(tmp_path: Path, text: str, says: str) -> None:
@@ -286,16 +286,16 @@ def test_a_file_of_another_drive_is_refused(tmp_path: Path, seen: Seen) -> None:
     path = tmp_path / "boxes.txt"
     path.write_text(f"{len(seen.recording)},-1,10,20,30,40,0.9\n")
     check_detections(seen.recording, path)
-    with pytest.raises(DatasetError, match="every 2th"):
+    with pytest.raises(DatasetError, match="the stride is 2"):
         check_detections(seen.recording, path, stride=2)
     path.write_text(f"{len(seen.recording) + 1},-1,10,20,30,40,0.9\n")
     with pytest.raises(DatasetError, match="ends at"):
         check_detections(seen.recording, path)
     path.write_text("1,-1,9000,20,30,40,0.9\n")
-    with pytest.raises(DatasetError, match="outside of the image"):
+    with pytest.raises(DatasetError, match="outside the image"):
         check_detections(seen.recording, path)
     path.write_text("1,-1,9000,20,30,40,0.9\n1,-1,-10,20,30,40,0.9\n")
-    assert check_detections(seen.recording, path).endswith("2 boxes, 2 of car; 1 outside of the image are dropped")
+    assert check_detections(seen.recording, path).endswith("2 boxes, 2 of car; 1 outside the image are dropped")
     with pytest.raises(ConfigurationError, match=r"remove source\.loop"):
         open_source(load(None, {"source.uri": "demo", "source.loop": True, "source.detections": str(path)}))
     assert Configuration().source.detections == ""

@@ -165,13 +165,13 @@ def test_both_kinds_of_file_are_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("", "holds 0 poses"),
-        ("0.0 0 0 0 0 0 0 1\n", "holds 1 poses"),
+        ("", "has 0 poses"),
+        ("0.0 0 0 0 0 0 0 1\n", "has 1 poses"),
         ("0.0 0 0 0 0 0 0 1\n0.1 0 0 0 0 0 0\n", "line 2 is no TUM pose"),
         ("0.0 0 0 0 0 0 0 1\n0.1 nan 0 0 0 0 0 1\n", "line 2 is no TUM pose"),
         ("0.0 0 0 0 0 0 0 1\n0.1 0 0 0 1 1 0 1\n", "no unit quaternion"),
         ("0.1 0 0 0 0 0 0 1\n0.1 0 0 0 0 0 0 1\n", "pose 1 is not later"),
-        ("1e18 0 0 0 0 0 0 1\n2e18 0 0 0 0 0 0 1\n", "none in seconds"),
+        ("1e18 0 0 0 0 0 0 1\n2e18 0 0 0 0 0 0 1\n", "not in seconds"),
         ("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 0 0 1 0 0 0 0\n", "line 2 is no KITTI pose"),
         ("time,x,y\n", "line 1 is no TUM pose"),
     ],
@@ -196,11 +196,11 @@ def test_a_file_of_another_drive_is_refused(tmp_path: Path) -> None:
         check_odometry(demo, short)
     whole = kitti(tmp_path / "whole", trajectory(len(demo)).poses)
     check_odometry(demo, whole)
-    with pytest.raises(DatasetError, match="give TUM lines"):
+    with pytest.raises(DatasetError, match="use TUM lines"):
         check_odometry(demo, whole, stride=2)
     early = trajectory(12)
     assert early.t_ns is not None
-    with pytest.raises(DatasetError, match="lie outside the recording's"):
+    with pytest.raises(DatasetError, match="are outside the recording's"):
         check_odometry(demo, tum(tmp_path / "early", TimedPoses(early.poses, early.t_ns - 10**12)))
 
 

@@ -72,13 +72,13 @@ def test_detections_by_frame_best_first(tmp_path: Path) -> None:
     ("file", "text", "said"),
     [
         ("label_02/0002.txt", "0 1 Car 0 0\n", "line 1 has 5 columns"),
-        ("label_02/0002.txt", "0 1 Car 0 0 x 1 1 2 2 1 1 1 1 1 1 1\n", "line 1 is no label"),
-        ("label_02/0002.txt", "0 1 Car 0 0 nan 1 1 2 2 1 1 1 1 1 1 1\n", "line 1 has numbers that no label has"),
-        ("label_02/0002.txt", "99 1 Car 0 0 0 1 1 2 2 1 1 1 1 1 1 1\n", "40 poses, but labels go on to 99"),
+        ("label_02/0002.txt", "0 1 Car 0 0 x 1 1 2 2 1 1 1 1 1 1 1\n", "line 1 is not a label"),
+        ("label_02/0002.txt", "0 1 Car 0 0 nan 1 1 2 2 1 1 1 1 1 1 1\n", "line 1 has invalid numbers"),
+        ("label_02/0002.txt", "99 1 Car 0 0 0 1 1 2 2 1 1 1 1 1 1 1\n", "40 poses, but its labels end at frame 99"),
         ("pose_cam0/0002.txt", "1 0 0\n", "line 1 is no KITTI pose"),
         ("pose_cam0/0002.txt", "", "has no poses"),
         ("calib/0002.txt", "P0: 1\n", "has no P2"),
-        ("oxts/0002.txt", "1 2 3\n", "line 1 is no GPS/IMU reading of 30"),
+        ("oxts/0002.txt", "1 2 3\n", "line 1 is not a GPS/IMU reading of 30"),
         ("oxts/0002.txt", "", "has no readings"),
     ],
 )
@@ -100,7 +100,7 @@ def test_missing_things_are_named(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"no detections of sequence 0009"):
         read_detections(root / "det_02_rrc", "0009", 3)
     (root / "det_02_rrc" / "Car" / "0002.txt").write_text("0,1,2,3\n")
-    with pytest.raises(DatasetError, match=r"Car/0002\.txt: line 1 is no detection"):
+    with pytest.raises(DatasetError, match=r"Car/0002\.txt: line 1 is not a detection"):
         read_detections(root / "det_02_rrc", "0002", 3)
     (root / "pose_cam0" / "0002.txt").unlink()
     with pytest.raises(DatasetError, match=r"neither oxts/0002\.txt nor pose_cam0/0002\.txt"):

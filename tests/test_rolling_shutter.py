@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from birdslam.calibration.lens_windows import CornersOfImage
-from birdslam.calibration.readout import USUAL, readout_of_drive
+from birdslam.calibration.readout import PRIOR, readout_of_drive
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import Pose
 from birdslam.geometry.rolling_shutter import RollingShutter
@@ -129,13 +129,13 @@ def test_a_drive_shows_how_long_its_camera_reads(readout_s: float) -> None:
     by_drive, sigma_s = found.by_drive
     assert sigma_s < 0.006
     assert abs(by_drive - readout_s) < 2.0 * sigma_s
-    assert found.sigma_s < min(sigma_s, USUAL.sigma_s)
+    assert found.sigma_s < min(sigma_s, PRIOR.sigma_s)
 
 
 def test_what_is_usual_holds_where_the_drive_shows_nothing() -> None:
     standing = [CornersOfImage(each.ids, each.px, 0.05 * k) for k, each in enumerate(corners(0.02, 1, 1) * 30)]
-    assert readout_of_drive(standing, CAMERA) == USUAL
-    assert readout_of_drive([], CAMERA) == USUAL
+    assert readout_of_drive(standing, CAMERA) == PRIOR
+    assert readout_of_drive([], CAMERA) == PRIOR
 
 
 def test_a_camera_file_states_it(tmp_path: Path) -> None:

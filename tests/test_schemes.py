@@ -170,9 +170,9 @@ def test_help_the_page_and_messages_name_a_toy_source(toy: Path, capsys: pytest.
     assert "| `toy:FILE` | a toy | recorded | calibration | frame rate |" in capsys.readouterr().out
     for door in (["run", "--source", "toi:x"], ["evaluate", "odometry", "toi:x"], ["calibrate", "toi:x"]):
         assert main([*door, "--output", str(toy.parent / "out")]) == 2
-        assert "no such source 'toi:'; there are demo, " in (said := capsys.readouterr().err)
+        assert "unknown source 'toi:'; choose from demo, " in (said := capsys.readouterr().err)
         assert "toy:FILE" in said
-    with pytest.raises(DatasetError, match="topics are of ROS bags"):
+    with pytest.raises(DatasetError, match="topics need a ROS bag"):
         open_source(load(None, {"source.uri": f"toy:{toy}", "source.topics.image": "/a"}))
 
 

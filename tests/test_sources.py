@@ -172,7 +172,7 @@ def test_distortion_is_taken_out_on_the_way() -> None:
     ("overrides", "message"),
     [
         ({}, "no source: give --source"),
-        ({"source.uri": "lidar:x"}, r"no such source 'lidar:'; there are demo, .*, v4l2:"),
+        ({"source.uri": "lidar:x"}, r"unknown source 'lidar:'; choose from demo, .*, v4l2:"),
         ({"source.uri": "v4l2:/dev/none"}, "needs a camera file"),
     ],
 )
@@ -182,7 +182,8 @@ def test_a_source_that_can_be_none(overrides: dict[str, str], message: str) -> N
 
 
 def live(uri: str, **source: object) -> Configuration:
-    return Configuration(camera=CAMERA, source=SourceConfig(uri=uri, camera_timeout_s=1.0, **source))  # type: ignore[arg-type]
+    # type: ignore[arg-type]
+    return Configuration(camera=CAMERA, source=SourceConfig(uri=uri, camera_timeout_s=1.0, **source))
 
 
 def test_a_missing_recording_is_named(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ from birdslam.sources.speed_file import (
     read_speeds,
     with_speeds,
 )
-from birdslam.sources.speed_log import KEPT_NS, KEPT_READINGS, SpeedLog
+from birdslam.sources.speed_log import MAX_AGE_NS, MAX_READINGS, SpeedLog
 from birdslam.types import SpeedReading
 from tests.recordings import PERIOD_NS, Frames
 from tests.recordings import SMALL as CAMERA
@@ -60,12 +60,12 @@ def test_a_line_says_as_much_as_it_knows(tmp_path: Path) -> None:
     "line", ["3", "3,", "fast 3", "3 fast", "nan 3", "inf 3", "1e30 3", ",3", "1 2 3 4 5 6", "1;2", "2026-01-01 3"]
 )
 def test_a_torn_line_is_named(tmp_path: Path, line: str) -> None:
-    with pytest.raises(DatasetError, match=r"speed\.csv: line 3 is no time in s and speed"):
+    with pytest.raises(DatasetError, match=r"speed\.csv: line 3 is not a time in s and a speed"):
         read_speeds(file(tmp_path, f"0 1\n# so far\n{line}\n4 5\n"))
 
 
 def test_a_file_without_speeds_is_named(tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match=r"speed\.csv: holds no speeds"):
+    with pytest.raises(DatasetError, match=r"speed\.csv: no speeds"):
         read_speeds(file(tmp_path, "# t v\n"))
     (tmp_path / "bytes").write_bytes(b"\xff\xfe\x00")
     for path in (tmp_path / "nowhere", tmp_path / "bytes", tmp_path):
@@ -79,7 +79,7 @@ def test_what_a_failing_sensor_says_is_passed_on_but_calibrates_nothing(tmp_path
     assert [one.t_ns // 10**8 for one in log.readings] == [0, 10, 20, 15, 30]
     assert math.isnan(log.readings[1].speed_mps)
     assert math.isnan(log.readings[4].sigma_mps)
-    with pytest.raises(DatasetError, match="line 2: nan m/s at 1 s is no speed of a car"):
+    with pytest.raises(DatasetError, match="line 2: nan m/s at 1 s is not the speed of a car"):
         read_speed_curve(path)
     with pytest.raises(DatasetError, match="line 3 is not later"):
         read_speed_curve(file(tmp_path, "0 1\n2 1\n1 1\n"))
@@ -90,14 +90,14 @@ def test_what_a_failing_sensor_says_is_passed_on_but_calibrates_nothing(tmp_path
 def test_a_frame_carries_the_readings_of_the_second_before_it(times_ns: list[int], t_ns: int) -> None:
     readings = [reading(one, float(number)) for number, one in enumerate(times_ns)]
     come_ns = [max(times_ns[: number + 1]) for number in range(len(times_ns))]
-    expected = [one for one, come in zip(readings, come_ns, strict=True) if t_ns - KEPT_NS < come <= t_ns]
+    expected = [one for one, come in zip(readings, come_ns, strict=True) if t_ns - MAX_AGE_NS < come <= t_ns]
     assert list(SpeedLog(readings).until(t_ns)) == expected
 
 
 def test_a_frame_carries_at_most_the_newest_readings() -> None:
     log = SpeedLog(reading(number * 1_000_000) for number in range(3_000))
     borne = log.until(2_000_500_000)
-    assert len(borne) == KEPT_READINGS
+    assert len(borne) == MAX_READINGS
     assert borne[-1].t_ns == 2_000_000_000
 
 
@@ -116,7 +116,7 @@ def test_the_same_frames_bear_the_same_readings_offline_and_in_a_loop(tmp_path: 
 
 def test_a_file_of_another_clock_is_named(tmp_path: Path) -> None:
     for text in ("1700000000 3\n1700000001 3\n", "-9 3\n-8 3\n"):
-        with pytest.raises(DatasetError, match=r"speed\.csv: its times .* lie outside the recording's, 0 to 0\.5 s"):
+        with pytest.raises(DatasetError, match=r"speed\.csv: its times .* are outside the recording's, 0 to 0\.5 s"):
             with_speeds(Frames(5), file(tmp_path, text))
 
 
@@ -145,7 +145,7 @@ def test_several_drives_have_a_file_each(tmp_path: Path) -> None:
 def test_bad_speed_files_of_an_evaluation_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = ["--output", str(tmp_path / "out")]
     for speed, wanted in (
-        (file(tmp_path, "0 1\n1 fast\n"), "speed.csv: line 2 is no time"),
+        (file(tmp_path, "0 1\n1 fast\n"), "speed.csv: line 2 is not a time"),
         (tmp_path, "demo.txt: can't be read"),
         (tmp_path / "none.csv", "none.csv: can't be read"),
     ):
@@ -187,9 +187,9 @@ def test_fixes_alone_give_the_speed(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("time_s,colour\n1,2\n", "line 1: names neither a speed"),
-        ("time_s,speed_mps\n1,2\nx,3\n", "line 3 does not hold what the first line names"),
-        ("time_s,speed_mps\n1\n", "line 2 does not hold"),
+        ("time_s,colour\n1,2\n", "line 1: has no column of speed"),
+        ("time_s,speed_mps\n1,2\nx,3\n", "line 3 does not match the header"),
+        ("time_s,speed_mps\n1\n", "line 2 does not match"),
     ],
 )
 def test_a_table_that_is_none_is_named(text: str, said: str, tmp_path: Path) -> None:

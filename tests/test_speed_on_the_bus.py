@@ -38,7 +38,7 @@ from birdslam.runtime.topology import key_of
 from birdslam.runtime.transport.bus import Bus, Message
 from birdslam.runtime.wire import Trace, decode, encode
 from birdslam.sources.recording import RecordedFrame
-from birdslam.sources.speed_log import KEPT_READINGS, added
+from birdslam.sources.speed_log import MAX_READINGS, added
 from birdslam.types import EgoEdge, FrameRef, Measurements, SpeedReading, SpeedSource, Status
 from tests.foreign_sender import foreign_session, matched
 from tests.recordings import SMALL as CAMERA
@@ -62,7 +62,7 @@ class Inbox:
         self._messages: deque[Message] = deque()
 
     def come(self, record: msgspec.Struct, t_received_ns: int) -> None:
-        if len(self._messages) == KEPT_READINGS:
+        if len(self._messages) == MAX_READINGS:
             self._messages.popleft()
             self.dropped += 1
         self._messages.append(Message(record, Trace(), t_received_ns))
@@ -104,12 +104,12 @@ def test_a_flood_leaves_the_newest_and_is_counted(caplog: pytest.LogCaptureFixtu
             inbox.come(reading(5_000 * frame + number), frame * 30 * MS)
         borne = speeds.at(frame * 30 * MS, frame * 30 * MS)
         assert [one.t_ns for one in borne] == list(range(5_000 * frame + 4_800, 5_000 * (frame + 1)))
-    assert speeds.counters()["speeds"] == 3 * KEPT_READINGS
-    assert speeds.counters()["speeds_dropped"] == 3 * (5_000 - KEPT_READINGS)
+    assert speeds.counters()["speeds"] == 3 * MAX_READINGS
+    assert speeds.counters()["speeds_dropped"] == 3 * (5_000 - MAX_READINGS)
     assert len([record for record in caplog.records if "the car's speed" in record.message]) == 1
     stamps = {"frame_id": 1 << 40, "t_source_ns": 1 << 62, "t_capture_ns": 1 << 62, "t_utc_ns": 1 << 62}
     full = SpeedReading(t_ns=1 << 62, speed_mps=1.5, sigma_mps=0.5, yaw_rate_radps=0.5, yaw_rate_sigma_radps=0.5)
-    assert len(encode(FrameRef(**stamps, speeds=(full,) * KEPT_READINGS))) < 32_000  # half of a message
+    assert len(encode(FrameRef(**stamps, speeds=(full,) * MAX_READINGS))) < 32_000  # half of a message
 
 
 # --- capture ---
@@ -213,7 +213,7 @@ def test_frames_bear_what_a_car_says_at_50_hz_malformed_and_flooding(
             ref = node.frame()
             most, counters = max(most, len(ref.speeds)), node.node.counters()
             assert time.monotonic() < until_s, counters
-        assert most == KEPT_READINGS
+        assert most == MAX_READINGS
         assert counters["dropped"] == ref.dropped == 0  # no frame is
         health = Meter("capture", node.configuration, FIRST).health(time.monotonic_ns(), "full", counters)
         assert (health.malformed, health.speeds_dropped) == (5, counters["speeds_dropped"])
@@ -296,7 +296,8 @@ def test_a_recording_gives_its_frames_the_readings_that_they_bore(tmp_path: Path
     writer.close({})
 
     def borne(**settings: object) -> list[bytes]:
-        source = open_source(Configuration(source=SourceConfig(uri=f"mcap:{path}", **settings)))  # type: ignore[arg-type]
+        # type: ignore[arg-type]
+        source = open_source(Configuration(source=SourceConfig(uri=f"mcap:{path}", **settings)))
         times = {"t_source_ns": 0, "t_capture_ns": 0, "t_utc_ns": 0}
         return [encode(FrameRef(frame_id=f.index, speeds=f.speeds, **times)) for f in source.frames()]
 

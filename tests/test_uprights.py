@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from birdslam.calibration.lens import FIELD_OF_VIEW_DEG, WIDE_SIGMA_REL, k1_by_bend
 from birdslam.calibration.lens_adjustment import SIGMA_K1
-from birdslam.calibration.uprights import LensByUprights, lens_by_uprights, upright_edges
+from birdslam.calibration.uprights import LensByVerticalEdges, find_vertical_edges, lens_by_vertical_edges
 from birdslam.runtime.calibration.given import FocalLength
 from birdslam.runtime.calibration.lens import with_uprights
 
@@ -42,7 +42,7 @@ def street(focal: float, k1: float = 0.0, fisheye: bool = False, roll_rad: float
 @given(st.floats(-0.3, 0.05), st.floats(-0.03, 0.03), st.integers(0, 3))
 @settings(max_examples=8, deadline=None)
 def test_a_straight_drive_shows_the_distortion_within_its_sigma(k1: float, roll_rad: float, seed: int) -> None:
-    found = lens_by_uprights(street(FOCAL, k1, roll_rad=roll_rad, seed=seed))
+    found = lens_by_vertical_edges(street(FOCAL, k1, roll_rad=roll_rad, seed=seed))
     assert found is not None
     assert abs(found.bend - k1 / FOCAL**2) < 3.0 * found.bend_sigma
     assert found.bend_sigma < 0.3
@@ -51,21 +51,21 @@ def test_a_straight_drive_shows_the_distortion_within_its_sigma(k1: float, roll_
 
 @pytest.mark.parametrize("focal", [0.48, 0.42])
 def test_a_fisheye_is_told_with_its_focal_length(focal: float) -> None:
-    found = lens_by_uprights(street(focal, fisheye=True))
+    found = lens_by_vertical_edges(street(focal, fisheye=True))
     assert found is not None
     assert found.fisheye_focal is not None
     assert found.fisheye_focal == pytest.approx(focal, rel=WIDE_SIGMA_REL)
 
 
 def test_what_looks_like_a_fisheye_of_a_hundred_degrees_may_be_a_pinhole_with_distortion() -> None:
-    found = lens_by_uprights(street(0.57, fisheye=True))
+    found = lens_by_vertical_edges(street(0.57, fisheye=True))
     assert found is not None
     assert found.fisheye_focal is None
 
 
 def test_few_edges_say_nothing() -> None:
-    assert lens_by_uprights([]) is None
-    assert lens_by_uprights([edges[:2] for edges in street(FOCAL)]) is None
+    assert lens_by_vertical_edges([]) is None
+    assert lens_by_vertical_edges([edges[:2] for edges in street(FOCAL)]) is None
 
 
 def test_edges_that_stand_in_the_upper_half_are_found_in_pixels_from_the_middle() -> None:
@@ -74,19 +74,19 @@ def test_edges_that_stand_in_the_upper_half_are_found_in_pixels_from_the_middle(
     cv2.line(image, (100, 100), (260, 110), 20, 5)  # level
     cv2.line(image, (500, 60), (650, 200), 20, 5)  # leans too far
     cv2.line(image, (700, 350), (700, 540), 20, 5)  # in the lower half, where vehicles are
-    edges = upright_edges(image)
+    edges = find_vertical_edges(image)
     assert len(edges) >= 2  # both sides of the one
     ends_px = edges * WIDTH_PX + 0.5 * (np.array([WIDTH_PX, 562]) - 1.0)
     assert np.abs(ends_px[..., 0] - 300.0).max() < 6.0
     assert (ends_px[:, 0, 1] < ends_px[:, 1, 1]).all()
-    assert np.array_equal(edges, upright_edges(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)))
-    assert upright_edges(np.full((90, 160), 128, np.uint8)).shape == (0, 2, 2)
+    assert np.array_equal(edges, find_vertical_edges(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)))
+    assert find_vertical_edges(np.full((90, 160), 128, np.uint8)).shape == (0, 2, 2)
 
 
 def test_a_fisheye_of_unknown_view_takes_its_focal_length_from_upright_lines() -> None:
     view_deg, sigma_rel = FIELD_OF_VIEW_DEG["dashcam"]
     unknown = FocalLength(650.0, sigma_rel, f"that of a dashcam, {view_deg:g} deg across")
-    uprights = LensByUprights(bend=-0.9, bend_sigma=0.1, fisheye_focal=0.45, edges=500)
+    uprights = LensByVerticalEdges(bend=-0.9, bend_sigma=0.1, fisheye_focal=0.45, edges=500)
     found = with_uprights(unknown, uprights, WIDTH_PX)
     assert found.fisheye
     assert found.px == 450.0

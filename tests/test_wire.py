@@ -37,7 +37,7 @@ from birdslam.runtime.wire import (
     decode,
     encode,
 )
-from birdslam.sources.speed_log import KEPT_READINGS
+from birdslam.sources.speed_log import MAX_READINGS
 from birdslam.types import (
     Approach,
     Attitude,
@@ -679,7 +679,7 @@ def test_the_topology_is_closed() -> None:
         assert all(TOPICS[topic].producer == node.name for topic in node.sends)
         assert all(TOPICS[topic].producer in {*NODES, MAP.name, CAR.name} for topic in node.receives)
     assert sorted(topic for node in (*PROCESSES.values(), CAR) for topic in node.sends) == sorted(TOPICS)
-    assert TOPICS["speed"].depth == KEPT_READINGS
+    assert TOPICS["speed"].depth == MAX_READINGS
     assert all(topic.depth == 1 for topic in TOPICS.values() if topic.hot)
     assert key_of("car-1", "estimate") == "birdslam/car-1/v1/estimate"
     assert key_of("car-1", "health/perceive") == "birdslam/car-1/v1/health/perceive"

@@ -1,6 +1,6 @@
-"""Recordings in: frames, camera and truth of KITTI drives, video files, ROS bags and the shipped drive.
+"""Recordings: frames, camera and ground truth of KITTI drives, video files, ROS bags and the shipped drive.
 
-Read `recording` first: the interface that `kitti`, `video`, `rosbag` and `shipped_drive` implement. `schemes` is the
-table of them all, by which `opening` opens any by its URI. `kitti_tracking` has the labels and detections of KITTI's
-tracking benchmark. Whatever can't be read raises `recording.DatasetError`, which names the path and the cause.
+Read `recording` first: the interface of `kitti`, `video`, `rosbag` and `shipped_drive`. `schemes` is their table,
+`opening` opens one by URI. `kitti_tracking` has the labels and detections of KITTI's tracking benchmark. All errors
+are `recording.DatasetError` and name the path and the cause.
 """

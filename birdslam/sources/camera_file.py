@@ -20,15 +20,15 @@ def load_camera(path: Path) -> Camera:
     except OSError as error:
         raise DatasetError(f"camera file {path}: can't be read: {error.strerror}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        remedy = "`birdslam calibrate RECORDING --intrinsics FILE` takes calibrations of other projects"
-        raise DatasetError(f"camera file {path}: no TOML ({error}); {remedy}") from None
+        remedy = "`birdslam calibrate RECORDING --intrinsics FILE` imports calibrations of other projects"
+        raise DatasetError(f"camera file {path}: not TOML ({error}); {remedy}") from None
     except (ValueError, msgspec.ValidationError) as error:
         raise DatasetError(f"camera file {path}: {error}") from None
 
 
 def camera_text(camera: Camera, comments: Iterable[str]) -> str:
-    """What a camera file holds: every field, each number to its last digit, below lines of comment."""
+    """The text of a camera file: all fields at full precision, below comment lines."""
     lines = [f"# {line}" for line in comments]
-    # A number, a truth value or a list of numbers is written in JSON as in TOML
+    # Numbers, booleans and lists have the same form in JSON and TOML
     lines += [f"{key} = {json.dumps(value)}" for key, value in msgspec.to_builtins(camera).items()]
     return "\n".join(lines) + "\n"

@@ -1,9 +1,9 @@
-"""Boxes of another detector or tracker over a recording, as a file, in px of the undistorted images.
+"""Boxes of an external detector or tracker over a recording as a file, in px of the undistorted images.
 
 MOT challenge text: `frame,id,left,top,width,height,score,...`, frames from 1, score -1: not stated; all are cars.
-KITTI tracking text: `frame id type truncated occluded alpha x1 y1 x2 y2 ...`, frames from 0, the score the 18th column.
-COCO results: a JSON list of {"image_id", "category_id", "bbox": [left, top, width, height], "score", "track_id"},
-frames from 0. Errors are DatasetError and name the file and the first wrong line.
+KITTI tracking text: `frame id type truncated occluded alpha x1 y1 x2 y2 ...`, frames from 0, score in column 18.
+COCO results: JSON list of {"image_id", "category_id", "bbox": [left, top, width, height], "score", "track_id"}. Errors
+are DatasetError with the first wrong line.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from birdslam.perception.external import external_detections
 from birdslam.perception.families import Family
 from birdslam.sources.recording import DatasetError, Recording
 
-# COCO's category ids of who is on a road; others are boxes without a meaning here
+# COCO category ids of road users; other classes are ignored
 COCO = {1: "person", 2: "bicycle", 3: "car", 4: "motorcycle", 6: "bus", 8: "truck"}
 COCO_LAST = 90
 COCO_GAPS = frozenset({12, 26, 29, 30, 45, 66, 68, 69, 71, 83})  # ids that the 2017 set does not use
 COCO_80 = {0: "person", 1: "bicycle", 2: "car", 3: "motorcycle", 5: "bus", 7: "truck"}
-# KITTI's types: who is on a road, and what else its text may name, which has no meaning here
+# KITTI types of road users, and types that are ignored
 KITTI = {"Car": "car", "Van": "van", "Truck": "truck", "Pedestrian": "person", "Person": "person", "Cyclist": "cyclist"}
 KITTI_OTHERS = ("Person_sitting", "Tram", "Misc", "DontCare")
 NOT_STATED = -1.0  # a score in MOT's text
@@ -42,9 +42,9 @@ class _Box(NamedTuple):
 
 
 def read_detection_file(path: Path, detector: Family | EdgeSigma = "unknown") -> dict[int, Detections]:
-    """Frame -> its boxes, in the order of the file; a frame without an entry has none. Raises DatasetError.
+    """Boxes by frame in the order of the file; frames without an entry are missing. Raises DatasetError.
 
-    `detector` is as of `external_detections`.
+    `detector` as in `external_detections`.
     """
     try:
         if path.stat().st_size > _MAX_BYTES:
@@ -54,35 +54,35 @@ def read_detection_file(path: Path, detector: Family | EdgeSigma = "unknown") ->
         raise DatasetError(f"{path}: can't be read: {getattr(error, 'strerror', None) or 'not UTF-8'}") from None
     frames: dict[int, list[tuple[str, _Box]]] = {}
     is_json = text.lstrip()[:1] in ("[", "{")
-    for where, box in _coco(path, text) if is_json else _probable(path, list(_lines(path, text))):
+    for where, box in _coco(path, text) if is_json else _normalize_scores(path, list(_lines(path, text))):
         frames.setdefault(box.frame, []).append((where, box))
     if not frames:
         raise DatasetError(
-            f"{path}: holds no boxes; expected MOT or KITTI tracking text or COCO results. For YOLO text, COCO data "
+            f"{path}: no boxes; expected MOT or KITTI tracking text or COCO results. For YOLO text, COCO data "
             "sets or supervision's CSV use `BirdSLAM.step(frame, detections)`"
         )
     return {frame: _of_frame(path, boxes, detector) for frame, boxes in frames.items()}
 
 
 def check_detections(recording: Recording, path: Path, stride: int = 1) -> str:
-    """Returns what is remarkable about the boxes, or "".
+    """Returns a summary of the boxes.
 
-    Raises DatasetError where the file can't be of this recording: boxes after its end, or all outside its images.
+    Raises DatasetError if the file is not of this recording: boxes after its end, or all outside its images.
     """
     found = read_detection_file(path)
     if stride != 1:
-        raise DatasetError(f"{path}: has the boxes of each frame, and every {stride}th is driven")
+        raise DatasetError(f"{path}: has boxes for each frame, but the stride is {stride}")
     last = max(found)
     if last >= len(recording):
-        raise DatasetError(f"{path}: has boxes of frame {last}, {recording.name} ends at {len(recording) - 1}")
+        raise DatasetError(f"{path}: has boxes of frame {last}, {recording.name} ends at frame {len(recording) - 1}")
     width_px, height_px = recording.camera.width_px, recording.camera.height_px
     total = sum(len(boxes) for boxes in found.values())
     dropped = total - sum(len(boxes.inside(width_px, height_px)) for boxes in found.values())
     if dropped == total:
-        raise DatasetError(f"{path}: all boxes are outside of the image of {width_px}x{height_px} px")
+        raise DatasetError(f"{path}: all boxes are outside the image of {width_px}x{height_px} px")
     labels = Counter(label for boxes in found.values() for label in boxes.labels)
     words = f"{path}: {total} boxes, " + ", ".join(f"{count} of {label}" for label, count in labels.most_common(6))
-    return words + (f"; {dropped} outside of the image are dropped" if dropped else "")
+    return words + (f"; {dropped} outside the image are dropped" if dropped else "")
 
 
 def _of_frame(path: Path, boxes: list[tuple[str, _Box]], detector: Family | EdgeSigma) -> Detections:
@@ -109,11 +109,11 @@ def _lines(path: Path, text: str) -> Iterator[tuple[str, _Box]]:
             is_kitti = len(words) > 2 and words[2][:1].isalpha() and "," not in line
             yield f"line {number}", _kitti(words) if is_kitti else _mot(words)
         except ValueError as error:
-            raise DatasetError(f"{path}: line {number}: {error or 'is no box'}: {line.strip()[:60]!r}") from None
+            raise DatasetError(f"{path}: line {number}: {error or 'not a box'}: {line.strip()[:60]!r}") from None
 
 
-def _probable(path: Path, found: list[tuple[str, _Box]]) -> Iterator[tuple[str, _Box]]:
-    """Scores as probabilities: -1 is 1, and where any other is not in [0, 1] all are log odds."""
+def _normalize_scores(path: Path, found: list[tuple[str, _Box]]) -> Iterator[tuple[str, _Box]]:
+    """Scores as probabilities: -1 becomes 1; if any other is not in [0, 1], all are log odds."""
     stated = [box.score for _, box in found if box.score != NOT_STATED]
     log_odds = any(not 0.0 <= score <= 1.0 for score in stated)
     for where, box in found:
@@ -123,76 +123,78 @@ def _probable(path: Path, found: list[tuple[str, _Box]]) -> Iterator[tuple[str, 
 
 def _mot(words: list[str]) -> _Box:
     if len(words) < _MOT_COLUMNS:
-        raise ValueError(f"has {len(words)} columns, MOT's text has {_MOT_COLUMNS} at the least")
-    frame, track = (_whole(word) for word in words[:2])
+        raise ValueError(f"has {len(words)} columns, MOT text has at least {_MOT_COLUMNS}")
+    frame, track = (_to_whole(word) for word in words[:2])
     left, top, width, height, score = (float(word) for word in words[2:_MOT_COLUMNS])
     if frame < 1:
-        raise ValueError("MOT's frames begin at 1")
-    return _checked(_Box(frame - 1, max(track, -1), "car", (left, top, left + width, top + height), score))
+        raise ValueError("MOT frames start at 1")
+    return _check(_Box(frame - 1, max(track, -1), "car", (left, top, left + width, top + height), score))
 
 
 def _kitti(words: list[str]) -> _Box:
     if len(words) < _KITTI_COLUMNS:
-        raise ValueError(f"has {len(words)} columns, KITTI's text has {_KITTI_COLUMNS} at the least")
-    frame, track, kind = _whole(words[0]), _whole(words[1]), words[2]
+        raise ValueError(f"has {len(words)} columns, KITTI text has at least {_KITTI_COLUMNS}")
+    frame, track, kind = _to_whole(words[0]), _to_whole(words[1]), words[2]
     if kind not in KITTI and kind not in KITTI_OTHERS:
-        raise ValueError(f"type {kind} is none of {', '.join((*KITTI, *KITTI_OTHERS))}")
+        raise ValueError(f"type {kind} is not one of {', '.join((*KITTI, *KITTI_OTHERS))}")
     x1, y1, x2, y2 = (float(word) for word in words[6:_KITTI_COLUMNS])
     score = float(words[_KITTI_SCORE]) if len(words) > _KITTI_SCORE else 1.0
-    return _checked(_Box(frame, max(track, -1), KITTI.get(kind, kind.lower()), (x1, y1, x2, y2), score))
+    return _check(_Box(frame, max(track, -1), KITTI.get(kind, kind.lower()), (x1, y1, x2, y2), score))
 
 
 def _coco(path: Path, text: str) -> Iterator[tuple[str, _Box]]:
     try:
         entries = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise DatasetError(f"{path}: is no JSON: {error}") from None
+        raise DatasetError(f"{path}: not JSON: {error}") from None
     if not isinstance(entries, list):
-        raise DatasetError(f"{path}: COCO's results are a list of boxes")
+        raise DatasetError(f"{path}: COCO results are a list of boxes")
     labels = _coco_labels(path, entries)
     for number, entry in enumerate(entries):
         try:
             yield f"entry {number}", _coco_box(entry, labels)
         except (KeyError, TypeError, ValueError) as error:
-            raise DatasetError(f"{path}: entry {number} is no box of COCO's results: {error}") from None
+            raise DatasetError(f"{path}: entry {number} is not a box of COCO results: {error}") from None
 
 
 def _coco_labels(path: Path, entries: list[Any]) -> dict[int, str]:
-    """The class names of the ids: of the set that knows all of them; if both do, of the one with more cars."""
+    """Class names by id: of the id set that contains all ids; if both do, of the one with more cars."""
     ids = Counter(entry.get("category_id") for entry in entries if isinstance(entry, dict))
     numbers = {number for number in ids if isinstance(number, int)}
     of_2017 = all(1 <= number <= COCO_LAST for number in numbers) and COCO_GAPS.isdisjoint(numbers)
     of_80 = all(0 <= number < 80 for number in numbers)
     if not of_2017 and not of_80:
-        raise DatasetError(f"{path}: category_id: {sorted(numbers)[:5]} ... are neither COCO's 1 to 90 nor its 0 to 79")
+        raise DatasetError(
+            f"{path}: category_id: {sorted(numbers)[:5]} ... are neither in COCO's 1 to 90 nor in its 0 to 79"
+        )
     return COCO if of_2017 and (not of_80 or ids[3] >= ids[2]) else COCO_80
 
 
 def _coco_box(entry: dict[str, Any], labels: dict[int, str]) -> _Box:
     left, top, width, height = (float(number) for number in entry["bbox"])
-    category = _whole(entry["category_id"])
+    category = _to_whole(entry["category_id"])
     box_px = left, top, left + width, top + height
-    track = _whole(entry.get("track_id", -1))
+    track = _to_whole(entry.get("track_id", -1))
     label, score = labels.get(category, f"coco {category}"), float(entry.get("score", 1.0))
     if not 0.0 <= score <= 1.0:
         raise ValueError(f"score {score:g} is not in [0, 1]")
-    return _checked(_Box(_whole(entry["image_id"]), max(track, -1), label, box_px, score))
+    return _check(_Box(_to_whole(entry["image_id"]), max(track, -1), label, box_px, score))
 
 
-def _checked(box: _Box) -> _Box:
+def _check(box: _Box) -> _Box:
     if box.frame < 0:
-        raise ValueError(f"frame {box.frame} is none")
+        raise ValueError(f"frame {box.frame} is invalid")
     if not all(map(math.isfinite, (*box.box_px, box.score))):
         raise ValueError("needs finite numbers")
     x1, y1, x2, y2 = box.box_px
     if x2 < x1 or y2 < y1:
-        raise ValueError("its width or height is negative")
+        raise ValueError("width or height is negative")
     return box
 
 
-def _whole(number: Any) -> int:
-    """Raises ValueError for what is no whole number."""
+def _to_whole(number: Any) -> int:
+    """Raises ValueError unless the number is whole."""
     value = float(number)
     if not value.is_integer():
-        raise ValueError(f"{number!r} is no whole number")
+        raise ValueError(f"{number!r} is not a whole number")
     return int(value)

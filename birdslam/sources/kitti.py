@@ -1,9 +1,7 @@
-"""KITTI recordings (Geiger et al., 2012 and 2013): `find_layout` says where their parts lie; how they are read.
+"""KITTI recordings (Geiger et al., 2012 and 2013).
 
-Everything here raises DatasetError, which names the path and what is wrong with it. Times, poses and images belong
-together by the image's number: a number missing in the middle is an unreadable frame, never a shift. Where no times
-are given the drive is at KITTI's 10 Hz; KITTI's cameras stand KITTI_HEIGHT_M (1.65 m) over the road. Foreign axes are
-turned into ours here and in `trajectory.py`, nowhere else.
+Times, poses and images are matched by image number: a missing number is an unreadable frame. Without times the rate is
+10 Hz. KITTI's axes are converted here and in `trajectory.py` only. All errors are DatasetError and name the path.
 """
 
 from __future__ import annotations
@@ -24,7 +22,7 @@ from birdslam.sources.recording import DatasetError, RecordedFrame, Recording
 from birdslam.trajectory import read_kitti
 from birdslam.types import NS_PER_S
 
-KITTI_HEIGHT_M = 1.65  # of every KITTI camera over the road (Geiger et al. 2013); no calibration file says it
+KITTI_HEIGHT_M = 1.65  # of KITTI's cameras over the road (Geiger et al. 2013); calibration files lack it
 KITTI_RATE_HZ = 10.0
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 IMAGE_NUMBER = re.compile(r"[0-9]{1,12}")
@@ -33,18 +31,18 @@ JPEG_BEGIN, JPEG_END = b"\xff\xd8", b"\xff\xd9"
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the parts of one recording lie; `times` and `truth` need not exist."""
+    """Paths of the parts of a recording; `times` and `truth` may be missing."""
 
     name: str
     images: Path
     calibration: Path
-    key: str  # of the projection matrix of the camera used
+    key: str  # name of the camera's projection matrix
     times: Path | None = None
     truth: Path | None = None
 
 
 def find_layout(directory: Path) -> Layout:
-    """The layout of a recording, by what stands in its directory DIR (N is the sequence, R the root of all).
+    """Finds the layout of a recording from the content of its directory DIR (N: sequence, R: root).
 
     | layout   | DIR          | images        | calibration             | times                   | truth             |
     |----------|--------------|---------------|-------------------------|-------------------------|-------------------|
@@ -56,7 +54,7 @@ def find_layout(directory: Path) -> Layout:
     Raises DatasetError.
     """
     if not directory.is_dir():
-        raise DatasetError(f"{directory}: {'is no directory' if directory.exists() else 'no such directory'}")
+        raise DatasetError(f"{directory}: {'not a directory' if directory.exists() else 'no such directory'}")
     directory = directory.resolve()
     for index in (0, 2, 1, 3):
         images = directory / f"image_{index}"
@@ -77,18 +75,18 @@ def find_layout(directory: Path) -> Layout:
         sequences = sorted(folder.name for folder in images.glob("[0-9]*") if folder.is_dir())
         if sequences:
             raise DatasetError(
-                f"{directory}: holds the sequences {', '.join(sequences)}: name one, as in "
+                f"{directory}: contains the sequences {', '.join(sequences)}; name one, as in "
                 f"kitti:{images / sequences[0]}"
             )
         if images.is_dir():
             truth = directory / "pose_cam0.txt"
             times = directory / "times.txt"
             return Layout(directory.name, images, directory / "calib.txt", f"P{index}", times, truth)
-    raise DatasetError(f"{directory}: no KITTI recording: neither image_0 nor image_2 nor image_02 is in it")
+    raise DatasetError(f"{directory}: not a KITTI recording: no image_0, image_2 or image_02 in it")
 
 
 def find_images(folder: Path) -> dict[int, Path]:
-    """The images of a folder by number."""
+    """The images of a folder by number. Raises DatasetError."""
     images: dict[int, Path] = {}
     try:
         paths = sorted(folder.iterdir())
@@ -98,12 +96,12 @@ def find_images(folder: Path) -> dict[int, Path]:
         if path.suffix.lower() in IMAGE_SUFFIXES and IMAGE_NUMBER.fullmatch(path.stem):
             number = int(path.stem)
             if number in images:
-                raise DatasetError(f"{folder}: two images of number {number}: {images[number].name}, {path.name}")
+                raise DatasetError(f"{folder}: two images with number {number}: {images[number].name}, {path.name}")
             images[number] = path
     if not images:
         raise DatasetError(f"{folder}: no images in it (NNNNNN.png or .jpg)")
     span = max(images) - min(images) + 1
-    if 2 * len(images) < span:  # a stray file name must not become a million unreadable frames
+    if 2 * len(images) < span:  # a stray file name must not create a million unreadable frames
         raise DatasetError(f"{folder}: only {len(images)} images for the numbers {min(images)} to {max(images)}")
     return images
 
@@ -118,20 +116,20 @@ def read_image(path: Path) -> NDArray[np.uint8]:
 
 
 def decode_image(data: bytes) -> NDArray[np.uint8]:
-    """The image of a PNG or JPEG file, 8 bit, grey or BGR. Raises ValueError with the reason."""
+    """Decodes a PNG or JPEG file to 8 bit, grey or BGR. Raises ValueError with the reason."""
     if data.startswith(JPEG_BEGIN) and JPEG_END not in data[-32:]:
-        raise ValueError("the JPEG is cut off")  # OpenCV would fill the rest with grey and say nothing
+        raise ValueError("truncated JPEG")  # OpenCV would fill the rest with grey
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:
         image = None
     if image is None:
-        raise ValueError(f"torn or no image ({len(data)} bytes)")
+        raise ValueError(f"damaged or not an image ({len(data)} bytes)")
     return image  # type: ignore[return-value]
 
 
 def first_image_size(folder: Path, images: dict[int, Path]) -> tuple[Path, tuple[int, int]]:
-    """The first image that can be read, and its (width, height) in pixels. Raises DatasetError where none can be."""
+    """The first readable image and its (width, height) in pixels. Raises DatasetError if there is none."""
     reason = ""
     for path in images.values():
         try:
@@ -140,7 +138,7 @@ def first_image_size(folder: Path, images: dict[int, Path]) -> tuple[Path, tuple
             reason = reason or f"{path.name}: {error}"
         else:
             return path, (width_px, height_px)
-    raise DatasetError(f"{folder}: none of its images can be read ({reason})")
+    raise DatasetError(f"{folder}: no readable image ({reason})")
 
 
 def _read_lines(path: Path) -> list[str]:
@@ -159,7 +157,7 @@ def read_projection(path: Path, key: str) -> Floats:
     try:
         P = np.array([float(word) for word in words])
     except ValueError:
-        raise DatasetError(f"{path}: {key} holds something that is no number") from None
+        raise DatasetError(f"{path}: {key} contains a value that is not a number") from None
     if P.size != 12:
         raise DatasetError(f"{path}: {key} has {P.size} numbers, not 12")
     if not np.isfinite(P).all():
@@ -168,12 +166,12 @@ def read_projection(path: Path, key: str) -> Floats:
     if P[0, 0] <= 0.0 or P[1, 1] <= 0.0:
         raise DatasetError(f"{path}: {key} has the focal lengths {P[0, 0]:g}, {P[1, 1]:g} px")
     if np.abs([P[0, 1], P[1, 0], P[2, 0], P[2, 1], P[2, 2] - 1.0]).max() > 1e-6:
-        raise DatasetError(f"{path}: {key} is no projection matrix of a rectified camera")
+        raise DatasetError(f"{path}: {key} is not the projection matrix of a rectified camera")
     return P
 
 
 def read_times(path: Path) -> list[int]:
-    """Times in ns of KITTI's two kinds: seconds since the start, or date and time of day."""
+    """Times in ns from seconds since the start, or from date and time of day."""
     times: list[int] = []
     for number, line in enumerate(_read_lines(path), start=1):
         if not line.strip():
@@ -184,9 +182,9 @@ def read_times(path: Path) -> list[int]:
             else:
                 t_ns = round(float(line) * NS_PER_S)
         except (ValueError, OverflowError):
-            raise DatasetError(f"{path}: line {number} is no time: {line[:40]!r}") from None
+            raise DatasetError(f"{path}: line {number} is not a time: {line[:40]!r}") from None
         if times and t_ns <= times[-1]:
-            raise DatasetError(f"{path}: line {number} is not later than the time before it")
+            raise DatasetError(f"{path}: line {number} is not later than the previous time")
         times.append(t_ns)
     return times
 
@@ -197,7 +195,7 @@ class KittiRecording(Recording):
     def __init__(self, directory: Path, camera: Camera | None = None, stride: int = 1) -> None:
         layout = self._layout = find_layout(directory)
         self._images = find_images(layout.images)
-        self.numbers = range(min(self._images), max(self._images) + 1, stride)  # of the images, one a frame
+        self.numbers = range(min(self._images), max(self._images) + 1, stride)  # of the images, one per frame
         self.name = layout.name
         self.camera = self._open_camera(camera)
         self._t_ns: list[int] | None = None
@@ -207,7 +205,7 @@ class KittiRecording(Recording):
             if len(times) <= self.numbers[-1]:
                 raise DatasetError(
                     f"{layout.times}: {len(times)} times, but the images in {layout.images} "
-                    f"go on to number {max(self._images)}"
+                    f"end at number {max(self._images)}"
                 )
             self._t_ns = [times[number] for number in self.numbers]
             if len(self._t_ns) > 1:
@@ -215,17 +213,17 @@ class KittiRecording(Recording):
 
     @classmethod
     def frame_size(cls, path: Path, topics: BagTopics) -> tuple[int, int]:
-        """Of the first image that can be read. Raises DatasetError."""
+        """Size of the first readable image. Raises DatasetError."""
         folder = find_layout(path).images
         return first_image_size(folder, find_images(folder))[1]
 
     def _open_camera(self, camera: Camera | None) -> Camera:
-        """The camera given, or the recording's own; either must fit the first image that can be read."""
+        """The given camera, or the recording's own; must fit the first readable image."""
         path, (width_px, height_px) = first_image_size(self._layout.images, self._images)
         if camera is not None:
             if (camera.width_px, camera.height_px) != (width_px, height_px):
                 raise DatasetError(
-                    f"{path}: is {width_px}x{height_px}, but the camera given is {camera.width_px}x{camera.height_px}"
+                    f"{path}: is {width_px}x{height_px}, but the given camera is {camera.width_px}x{camera.height_px}"
                 )
             return camera
         (fx, _, cx, _), (_, fy, cy, _), _ = read_projection(self._layout.calibration, self._layout.key).tolist()
@@ -238,7 +236,7 @@ class KittiRecording(Recording):
         return len(self.numbers)
 
     def frames(self, start: int = 0) -> Iterator[RecordedFrame]:
-        """Every frame in order, read when asked for."""
+        """Yields the frames in order; images are read on demand."""
         for index, number in enumerate(self.numbers[start:], start):
             t_ns = self._t_ns[index] if self._t_ns else round(number / KITTI_RATE_HZ * NS_PER_S)
             try:
@@ -263,11 +261,11 @@ class KittiRecording(Recording):
 
     @property
     def directory(self) -> Path:
-        """The folder of the images; what else was recorded (LiDAR) stands beside it."""
+        """The folder of the images; other recorded data (LiDAR) is next to it."""
         return self._layout.images
 
     def truth_poses(self) -> Floats | None:
-        """(N, 3, 4) camera-0 rows of the frames. Raises DatasetError where the file is torn or too short."""
+        """(N, 3, 4) camera-0 rows of the frames. Raises DatasetError for a damaged or too short file."""
         path = self._layout.truth
         if path is None or not path.is_file():
             return None
@@ -276,13 +274,13 @@ class KittiRecording(Recording):
         except ValueError as error:
             raise DatasetError(str(error)) from None
         if len(rows) <= self.numbers[-1]:
-            raise DatasetError(f"{path}: {len(rows)} poses, but the images go on to number {max(self._images)}")
+            raise DatasetError(f"{path}: {len(rows)} poses, but the images end at number {max(self._images)}")
         return rows[list(self.numbers)]
 
     def T_cam0_cam(self) -> Floats:
-        """(4, 4) from the calibration (rectified cameras share their axes); identity where there is none.
+        """(4, 4) from the calibration; identity without one. Rectified cameras share their axes.
 
-        P = K [I | t] takes points of camera 0, so this camera stands at -t.
+        P = K [I | t] projects points of camera 0, so this camera is at -t.
         """
         out = np.eye(4)
         if self._layout.calibration.is_file():

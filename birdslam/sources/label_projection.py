@@ -1,8 +1,7 @@
-"""Labels of KITTI tracking in the image of a camera that they were not drawn in.
+"""Projects KITTI tracking labels to the image of another camera than camera 2.
 
-A label's box in the image belongs to camera 2. Its body, a cuboid in camera 0, belongs to none: in another camera the
-box is the hull of the cuboid's outline there. That hull is a little wider and higher than a box that is drawn around
-what is seen of a car (a cuboid has corners where a car is round).
+The cuboid of a label is in camera 0; its box in another image is the hull of the projected cuboid. It is slightly
+larger than a drawn box, since real cars have rounded corners.
 """
 
 from __future__ import annotations
@@ -18,16 +17,16 @@ from birdslam.geometry.camera import Camera
 from birdslam.trajectory import Transform, inverse
 
 DONT_CARE = "DontCare"  # a region without a body
-MIN_DISTANCE_M = 0.1  # what lies nearer to the camera's plane, or behind it, has no image
-MIN_INSIDE = 0.98  # of a hull's area: with less of it in the image the object is truncated
-# A cuboid's corners by (length, height, width), and its edges: pairs of corners that differ in one of them
+MIN_DISTANCE_M = 0.1  # min. depth of a projected point
+MIN_INSIDE_RATIO = 0.98  # share of a hull's area in the image, below it the object is truncated
+# Corners of a cuboid by (length, height, width), and edges: pairs of corners that differ in one coordinate
 _CORNERS = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-1.0, 0.0) for z in (-0.5, 0.5)])
 _EDGES = np.array([(i, j) for i in range(8) for j in range(i) if np.count_nonzero(_CORNERS[i] != _CORNERS[j]) == 1])
 
 
 @dataclass(frozen=True)
 class Label:
-    """One labelled object in one frame; `place_m` (3,) is its bottom centre in camera 0 (x right, y down, z ahead)."""
+    """A labelled object in one frame; `place_m` (3,) is its bottom centre in camera 0 (x right, y down, z ahead)."""
 
     frame: int
     track: int
@@ -43,9 +42,9 @@ class Label:
 
 
 def project_labels(labels: Iterable[Label], camera: Camera, T_cam0_camera: Transform) -> list[Label]:
-    """The labels that are in the camera's image, with the boxes and the truncation that they have there.
+    """The labels in the camera's image with their boxes and truncation there.
 
-    Regions without a body keep their boxes: what they hide is far away. Occlusion stays as labelled.
+    "DontCare" regions keep their boxes, since they are far away; occlusion is unchanged.
     """
     out = []
     for label in labels:
@@ -58,12 +57,12 @@ def project_labels(labels: Iterable[Label], camera: Camera, T_cam0_camera: Trans
             inside = float(np.prod(high - low) / np.prod(hull[2:] - hull[:2]))
             if inside > 0.0:
                 box = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-                out.append(replace(label, box_px=box, truncated=float(inside < MIN_INSIDE)))
+                out.append(replace(label, box_px=box, truncated=float(inside < MIN_INSIDE_RATIO)))
     return out
 
 
 def hull_px(label: Label, camera: Camera, T_cam0_camera: Transform) -> Floats | None:
-    """(4,) x1, y1, x2, y2 of the body's outline in pixels, not cut by the image; None where it lies behind."""
+    """(4,) x1, y1, x2, y2 of the projected cuboid in pixels, not clipped; None behind the camera."""
     R_cam0_body = Rotation.from_euler("y", label.rotation_y_rad).as_matrix()
     size_m = np.array([label.length_m, label.height_m, label.width_m])
     p_cam0 = (_CORNERS * size_m) @ R_cam0_body.T + label.place_m
@@ -74,7 +73,7 @@ def hull_px(label: Label, camera: Camera, T_cam0_camera: Transform) -> Floats | 
     ends = ends[~near.all(axis=1)]
     if not len(ends):
         return None
-    for edge in ends:  # an edge through the camera's plane begins in front of it
+    for edge in ends:  # an edge through the camera's plane is clipped in front of it
         (a, b) = edge if edge[0, 2] < edge[1, 2] else edge[::-1]
         if a[2] < MIN_DISTANCE_M:
             a += (MIN_DISTANCE_M - a[2]) / (b[2] - a[2]) * (b - a)

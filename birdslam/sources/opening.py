@@ -1,4 +1,4 @@
-"""Recorded drives by their URI, as the table in schemes.py says."""
+"""Opens recorded drives by URI with the table in schemes.py."""
 
 from __future__ import annotations
 
@@ -19,12 +19,10 @@ def open_recording(
     speeds: Path | None = None,
     topics: BagTopics = BagTopics(),  # noqa: B008
 ) -> Recording:
-    """Opens every `stride`-th frame of a recording, given its path or its URI (`video:FILE`; `schemes.RECORDED`).
+    """Opens every `stride`-th frame of a recording by path or URI (`video:FILE`, or any other of `schemes.RECORDED`).
 
-    `camera` replaces the recording's own calibration. `speeds` is a file of the car's own speed over the drive
-    (sources/speed_file.py). `topics` says which of a ROS bag are read.
-
-    Raises DatasetError where it can't be used.
+    `camera` replaces the recording's calibration. `speeds`: a file of vehicle speeds (sources/speed_file.py).
+    `topics`: topics of a ROS bag. Raises DatasetError if the recording cannot be used.
     """
     try:
         scheme, address = parse(uri_of(uri, schemes.RECORDED), schemes.RECORDED)
@@ -36,12 +34,12 @@ def open_recording(
 def open_address(
     scheme: Scheme, address: str, camera: Camera | None, stride: int, speeds: Path | None, topics: BagTopics
 ) -> Recording:
-    """`open_recording` of a URI that is parsed, for any scheme that is recorded."""
+    """`open_recording` for a parsed URI and any recorded scheme."""
     uri = f"{scheme.name}:{address}" if address else scheme.name
     if stride < 1:
         raise DatasetError(f"{uri}: the stride must be 1 or more, got {stride}")
     if "topics" in scheme.refused and topics != BagTopics():
-        raise DatasetError(f"{uri}: topics are of ROS bags (rosbag:PATH), and this is none")
+        raise DatasetError(f"{uri}: topics need a ROS bag (rosbag:PATH)")
     more = {"topics": topics} if "topics" in scheme.options else {}
     place = (Path(address).expanduser(),) if address else ()
     recording: Recording = scheme.load()(*place, camera=camera, stride=stride, **more)

@@ -1,7 +1,7 @@
-"""ROS bags as recorded drives (docs/ros.md): which topics are read, the camera, the frames and the car's own speed.
+"""ROS bags as recorded drives (docs/ros.md): topics, camera, frames and vehicle speed.
 
-Times are those of the messages' headers; where a bag's images bear none that grow, it is when the bag received them.
-An image that is not later than the one before it is an unreadable frame, and a bag that can't be read on ends with one.
+Times are header stamps, or receive times if the images' stamps do not increase. An image that is not later than the
+previous one is an unreadable frame, and a damaged bag ends with one.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from birdslam.sources.speed_file import SIGMA_MPS, YAW_RATE_SIGMA_RADPS
 from birdslam.sources.speed_log import SpeedLog
 from birdslam.types import NS_PER_S, SpeedReading
 
-MAX_CLOCK_ERROR_NS = NS_PER_S  # between the steps of two clocks: beyond it one of them was set
-RATED_IMAGES = 30  # the first ones: the median of their intervals gives the frame rate
+MAX_CLOCK_ERROR_NS = NS_PER_S  # between steps of two clocks: above it one of them was set
+RATE_IMAGES = 30  # number of images whose median interval gives the frame rate
 
 
 class BagCamera(NamedTuple):
-    """What a bag says of its camera; `mount` is None where nothing in it says how the camera stands over the road."""
+    """Camera information in a bag; `mount` is None if the bag does not state the camera's height over the road."""
 
     topic: str  # of the CameraInfo
     frame: str
@@ -41,7 +41,7 @@ class BagCamera(NamedTuple):
 
 
 class RosbagRecording(Recording):
-    """One camera's images in a ROS bag. Raises DatasetError where it can't be used."""
+    """The images of one camera in a ROS bag. Raises DatasetError if it cannot be used."""
 
     def __init__(
         self,
@@ -58,7 +58,7 @@ class RosbagRecording(Recording):
                 height_px, width_px = _first_image(bag, self._topic).shape[:2]
                 self.camera = self._own_camera(bag) if camera is None else camera
                 if (self.camera.width_px, self.camera.height_px) != (width_px, height_px):
-                    given = "the camera given" if camera else "its CameraInfo"
+                    given = "the given camera" if camera else "its CameraInfo"
                     raise BagError(
                         f"{path}: the images of {self._topic} are {width_px}x{height_px}, but {given} is for "
                         f"{self.camera.width_px}x{self.camera.height_px}"
@@ -75,7 +75,7 @@ class RosbagRecording(Recording):
 
     @classmethod
     def frame_size(cls, path: Path, topics: BagTopics) -> tuple[int, int]:
-        """Of the first image that can be read. Raises DatasetError."""
+        """Size of the first readable image. Raises DatasetError."""
         try:
             with Bag(path) as bag:
                 return _first_image(bag, _image_topic(bag, topics)).shape[1::-1]
@@ -84,7 +84,7 @@ class RosbagRecording(Recording):
 
     @classmethod
     def own_lens(cls, path: Path, topics: BagTopics) -> OwnLens:
-        """Of the CameraInfo, with the height of /tf_static. Raises DatasetError."""
+        """Intrinsics of the CameraInfo, with the height of /tf_static. Raises DatasetError."""
         try:
             with Bag(path) as bag:
                 found = _camera(bag, topics)
@@ -107,14 +107,14 @@ class RosbagRecording(Recording):
             raise BagError(f"{self._path}: {found.topic}: {error}") from None
 
     def _rate(self, bag: Bag) -> tuple[bool, float]:
-        """Whether the images' own times are used, and frames a second by them."""
-        first = list(islice(bag.messages(self._topic), RATED_IMAGES))
+        """Whether header stamps are used, and the frame rate by them."""
+        first = list(islice(bag.messages(self._topic), RATE_IMAGES))
         stamps = [stamp_ns(message.content) for message in first]
         stamped = len(stamps) < 2 or stamps[1] > stamps[0]
         times = stamps if stamped else [message.t_ns for message in first]
         gaps = [gap for gap in np.diff(times).tolist() if gap > 0]
         if not gaps:
-            raise BagError(f"{self._path}: {self._topic} holds {len(first)} images, and no two of growing time")
+            raise BagError(f"{self._path}: {self._topic} has {len(first)} images, but no two with increasing times")
         return stamped, NS_PER_S / float(np.median(gaps))
 
     def _time_ns(self, message: BagMessage) -> int:
@@ -133,7 +133,7 @@ class RosbagRecording(Recording):
         return -(-self._count // self._stride)
 
     def frames(self, start: int = 0) -> Iterator[RecordedFrame]:
-        """Every frame in order, decoded when asked for."""
+        """Yields the frames in order; images are decoded on demand."""
         last_ns, position, clock = None, -1, ImageClock()
         try:
             with Bag(self._path) as bag:
@@ -144,7 +144,7 @@ class RosbagRecording(Recording):
                     index, between = divmod(position, self._stride)
                     if between or index < start:
                         continue
-                    error = f"its time {t_ns / NS_PER_S:.3f} s is not later than the one before" if late else None
+                    error = f"its time {t_ns / NS_PER_S:.3f} s is not later than the previous one" if late else None
                     yield self._frame(index, last_ns, message, error)
             if position + 1 < self._count:
                 raise BagError(f"{self._path}: {self._topic} ends after {position + 1} of {self._count} images")
@@ -161,7 +161,7 @@ class RosbagRecording(Recording):
         return RecordedFrame(index, t_ns, image, error and f"{self._path}: {self._topic}: image {index}: {error}")
 
     def timed(self, topic: str, *types: str) -> list[tuple[int, Any]]:
-        """The messages of another topic of these types, with their times by the images' clock. Raises DatasetError."""
+        """Messages of another topic of these types, with times in the images' clock. Raises DatasetError."""
         try:
             with Bag(self._path) as bag:
                 bag.find(topic, *types)
@@ -170,7 +170,7 @@ class RosbagRecording(Recording):
             raise DatasetError(str(error)) from None
 
     def truth_poses(self) -> Floats | None:
-        """(N, 3, 4) rows of the camera at the frames, by the topic of truth; nan outside its time."""
+        """(N, 3, 4) camera poses at the frames from the truth topic; nan outside its times."""
         if not self._topics.truth:
             return None
         try:
@@ -185,15 +185,15 @@ class RosbagRecording(Recording):
 
 
 class ImageClock:
-    """Time of images across steps of their clock: uptime before NTP, a clock that is set, a first stamp of zero.
+    """Image times across steps of their clock: uptime before NTP, a clock that is set, a first stamp of zero.
 
-    Where the stamps and the times of recording advance by amounts that differ by more than a second, the stamps' clock
-    was set: they go on by the time of recording. A pause, by which both advance, stays.
+    If stamps and receive times advance by more than a second apart, the stamps' clock was set, and the receive times
+    are used for that step. A pause, over which both advance, stays.
     """
 
     def __init__(self) -> None:
         self._shift_ns = 0
-        self._last: tuple[int, int] | None = None  # stamp and time of recording
+        self._last: tuple[int, int] | None = None  # stamp and receive time
 
     def time_ns(self, stamp_ns: int, recorded_ns: int) -> int:
         """The time of the next image in the clock of the first."""
@@ -210,7 +210,7 @@ def _image_topic(bag: Bag, topics: BagTopics) -> str:
         return bag.find(topics.image, *IMAGES)
     found = bag.of_type(*IMAGES)
     if len(found) != 1:
-        reason = "has no images" if not found else f"has {len(found)} topics of images: name one (--topic)"
+        reason = "has no images" if not found else f"has {len(found)} image topics; name one (--topic)"
         raise BagError(f"{bag.path}: {reason}. {bag.listing(*IMAGES)}")
     return found[0]
 
@@ -221,16 +221,16 @@ def _camera(bag: Bag, topics: BagTopics) -> BagCamera:
     try:
         found = lens(next(bag.messages(topic)).content, is_rectified(image_topic))
     except ValueError as error:
-        raise BagError(f"{bag.path}: {topic}: {error}: a camera file is needed (--camera FILE)") from None
+        raise BagError(f"{bag.path}: {topic}: {error}; give a camera file (--camera FILE)") from None
     try:
         mount = StaticFrames(bag).mount(frame)
     except ValueError as error:
-        raise BagError(f"{bag.path}: {error}: a camera file is needed (--camera FILE)") from None
+        raise BagError(f"{bag.path}: {error}; give a camera file (--camera FILE)") from None
     return BagCamera(topic, frame, found, mount)
 
 
 def _info_topic(bag: Bag, topics: BagTopics, image_topic: str) -> str:
-    """By image_transport's rule it stands beside the images: /camera/image_raw/compressed, /camera/camera_info."""
+    """The CameraInfo next to the images, as in image_transport: /camera/image_raw/compressed, /camera/camera_info."""
     if topics.camera_info:
         return bag.find(topics.camera_info, CAMERA_INFO)
     found = bag.of_type(CAMERA_INFO)
@@ -242,7 +242,7 @@ def _info_topic(bag: Bag, topics: BagTopics, image_topic: str) -> str:
     if len(found) != 1:
         reason = "no CameraInfo" if not found else f"{len(found)} topics of CameraInfo"
         raise BagError(
-            f"{bag.path}: {reason} for {image_topic}: name one (--camera-info-topic), or give a camera file "
+            f"{bag.path}: {reason} for {image_topic}; name one (--camera-info-topic), or give a camera file "
             f"(--camera FILE). {bag.listing(CAMERA_INFO)}"
         )
     return found[0]
@@ -259,7 +259,7 @@ def _first_image(bag: Bag, topic: str) -> NDArray[np.uint8]:
             return _pixels(message)
         except ValueError as error:
             reason = reason or str(error)
-    raise BagError(f"{bag.path}: none of the images of {topic} can be read ({reason})")
+    raise BagError(f"{bag.path}: no readable image on {topic} ({reason})")
 
 
 def _pixels(message: BagMessage) -> NDArray[np.uint8]:

@@ -1,8 +1,8 @@
-"""The table of sources: what each scheme (`kitti:DIR`) is, what it knows of its camera and clock, which class opens it.
+"""Table of source schemes (`kitti:DIR`): description, camera, clock and the class that opens each.
 
-Every command, page and message that speaks of sources reads this table; a new one is a class (`Recording`) in a file of
-its own and an entry here. The classes are named, not imported, so that a help text loads neither OpenCV nor rosbags.
-runtime/schemes.py adds the sources of the runtime: live cameras and our own recordings.
+Commands, pages and messages about sources use this table; a new source is a `Recording` class and an entry here. The
+classes are named, not imported, so that help texts load neither OpenCV nor rosbags. runtime/schemes.py adds live
+sources.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 OF_A_RECORDING = ("stride", "speed", "odometry", "detections", "detector", "loop", "prefetch_frames")
-MCAP_HEAD_BYTES = 64  # the profile stands in the first record: "ros2" in a bag, "" in a recording of ours
+MCAP_HEAD_BYTES = 64  # the first record has the profile: "ros2" in a bag, "" in a birdslam recording
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,26 +22,26 @@ class Scheme:
     """A kind of source. Its addresses begin with `name:`."""
 
     name: str
-    written: tuple[str, ...]  # as a user writes it; a name without a colon needs no address
+    written: tuple[str, ...]  # notation for users; a name without a colon takes no address
     what: str
     opener: str  # module:class; called with (path, camera=, stride=); if `live` with (configuration, must_open)
-    camera: Literal["calibration", "intrinsics", "frame size", "nothing"]  # intrinsics: the height may be missing
+    camera: Literal["calibration", "intrinsics", "frame size", "nothing"]  # intrinsics: without the height
     clock: Literal["recorded times", "frame rate", "this computer's"]
     address: Literal["path", "device", "network", "topic"] = "path"
     live: bool = False
-    options: tuple[str, ...] = OF_A_RECORDING  # keys of [source] that it takes; uri, rate and frames hold for all
-    refused: tuple[str, ...] = ()  # keys that are an error beside it; others that it does not take are ignored
-    suffixes: tuple[str, ...] = ()  # by which a file's name alone says what it is
-    is_at: Callable[[Path], bool] = lambda path: False  # whether one lies there whose name does not say it
-    recognised: str = ""  # that in words
+    options: tuple[str, ...] = OF_A_RECORDING  # accepted keys of [source]; uri, rate and frames hold for all
+    refused: tuple[str, ...] = ()  # keys that raise an error; others are ignored
+    suffixes: tuple[str, ...] = ()  # file suffixes of this source
+    is_at: Callable[[Path], bool] = lambda path: False  # recognises a path without such a suffix
+    recognised: str = ""  # description of `is_at`
 
     def load(self) -> Any:
-        """The class that opens it, imported only now."""
+        """Imports and returns the class that opens it."""
         return pkgutil.resolve_name(self.opener)
 
 
 def _is_bag(path: Path) -> bool:
-    """A directory of `ros2 bag record`, or an MCAP file that ROS wrote."""
+    """A directory of `ros2 bag record`, or an MCAP file written by ROS."""
     if path.is_dir():
         return (path / "metadata.yaml").is_file()
     if path.suffix.lower() != ".mcap":
@@ -74,7 +74,7 @@ DEMO = Scheme(
 VIDEO = Scheme(
     name="video",
     written=("video:FILE", "video:DIR"),
-    what="a film, as OpenCV reads it; DIR: all films in it, one after the other in the order of their names",
+    what="a film readable by OpenCV; DIR: all its films in the order of their names",
     opener="birdslam.sources.films.video:VideoRecording",
     camera="frame size",
     clock="recorded times",
@@ -91,7 +91,7 @@ ROSBAG = Scheme(
     options=(*OF_A_RECORDING, "topics"),
     suffixes=(".bag", ".db3"),
     is_at=_is_bag,
-    recognised="a directory with metadata.yaml, an .mcap file that ROS wrote",
+    recognised="a directory with metadata.yaml, an .mcap file written by ROS",
 )
 KITTI = Scheme(
     name="kitti",
@@ -102,41 +102,41 @@ KITTI = Scheme(
     clock="recorded times",
     refused=("topics",),
     is_at=_is_kitti,
-    recognised="a directory with its folders of images",
+    recognised="a directory with KITTI's image folders",
 )
-# A path that several recognise is the first one's
+# The first match wins
 RECORDED = (DEMO, VIDEO, ROSBAG, KITTI)
 
 
 def written(schemes: Sequence[Scheme]) -> str:
-    """All of them as a user writes them, for help and messages."""
+    """All schemes in the notation for users, for help and messages."""
     return ", ".join(text for scheme in schemes for text in scheme.written)
 
 
 def scheme_of(uri: str, schemes: Sequence[Scheme]) -> Scheme | None:
-    """By what stands before the colon; None where it is none of these."""
+    """The scheme of the name before the colon, or None."""
     name = uri.partition(":")[0]
     return next((scheme for scheme in schemes if scheme.name == name), None)
 
 
 def parse(uri: str, schemes: Sequence[Scheme]) -> tuple[Scheme, str]:
-    """Returns the scheme and the address of a URI. Raises ValueError with the known schemes."""
+    """Returns the scheme and address of a URI. Raises ValueError with the known schemes."""
     scheme, (name, colon, address) = scheme_of(uri, schemes), uri.partition(":")
     if scheme is None:
-        raise ValueError(f"{uri}: no such source {name + colon!r}; there are {written(schemes)}")
+        raise ValueError(f"{uri}: unknown source {name + colon!r}; choose from {written(schemes)}")
     if not address and scheme.name not in scheme.written:
-        raise ValueError(f"{uri}: names none; expected {' or '.join(scheme.written)}")
+        raise ValueError(f"{uri}: has no address; expected {' or '.join(scheme.written)}")
     return scheme, address
 
 
 def scheme_at(path: Path, schemes: Sequence[Scheme]) -> Scheme | None:
-    """By what lies at a path; None where it is no source."""
+    """The scheme of an existing path, or None."""
     by_name = None if path.is_dir() else by_suffix(path, schemes)
     return by_name or next((scheme for scheme in schemes if scheme.is_at(path)), None)
 
 
 def by_suffix(path: Path, schemes: Sequence[Scheme]) -> Scheme | None:
-    """By a file's name alone."""
+    """The scheme of a file's suffix, or None."""
     return next((scheme for scheme in schemes if path.suffix.lower() in scheme.suffixes), None)
 
 

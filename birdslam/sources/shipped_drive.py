@@ -1,7 +1,7 @@
-"""The drive that ships with birdslam: rendered in the built-in world, with its truth; read with OpenCV and numpy alone.
+"""The drive that ships with birdslam: rendered in the built-in world, with ground truth.
 
-One file, `drive.npz`: every image as WebP, and what was true when it was taken.
-`world/demo_world.py` says what happens in it; `birdslam demo-drive make` renders it again.
+`drive.npz` has the images as WebP and the truth of each. `world/demo_world.py` defines it; `birdslam demo-drive make`
+renders it again.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from birdslam.types import NS_PER_S, Ground
 DIRECTORY = Path(__file__).parent / "drives" / "shipped"
 NAME = "demo"
 LABELS = ("car", "van", "truck", "bus", "cyclist", "pedestrian")
-# Columns of the file's `bodies`, one row for each body in the image of each frame
+# Columns of `bodies`, one row per body in the image of each frame
 COLUMNS = ("frame", "body", "label", "x_m", "y_m", "yaw_rad", "length_m", "width_m", "height_m", "vx_mps", "vy_mps",
            "visible", "truncated", "x1_px", "y1_px", "x2_px", "y2_px")  # fmt: skip
-# Columns of `lines`, which a drive may have: points of the painted lines and of the road's edges in ego
+# Columns of the optional `lines`: points of painted lines and road edges in ego
 LINE_COLUMNS = ("frame", "line", "kind", "x_m", "y_m")
 LINE_KINDS = ("solid", "dashed", "dotted", "double", "double_dashed", "kerb")
 _ARRAYS = ("images", "ends", "rate_hz", "poses", "ground", "bodies")
@@ -37,31 +37,31 @@ _ARRAYS = ("images", "ends", "rate_hz", "poses", "ground", "bodies")
 
 @dataclass(frozen=True)
 class TrueBody:
-    """A vehicle or person in one frame of the drive: its footprint's centre in ego, its size, what is seen of it."""
+    """A vehicle or person in one frame of the drive: footprint centre in ego, size and visibility."""
 
-    body: int  # the same through the whole drive
+    body: int  # persistent over the drive
     label: str  # of LABELS
     T_ego_body: SE2
     length_m: float
     width_m: float
     height_m: float
-    velocity_mps: tuple[float, float]  # over the ground, in ego's axes
-    visible: float  # share of its projection inside the image that nothing occludes
-    truncated: float  # share of its box that lies outside the image
+    velocity_mps: tuple[float, float]  # over the ground, in ego axes
+    visible: float  # visible share of its projection in the image
+    truncated: float  # share of its box outside the image
     box_px: tuple[float, float, float, float]  # of the whole body, clipped to the image
 
 
 @dataclass(frozen=True)
 class TrueLine:
-    """A painted line, or the road's edge (`kerb`), in one frame of the drive: also where it is hidden, or has gaps."""
+    """A painted line or road edge (`kerb`) in one frame of the drive, hidden parts and gaps included."""
 
-    line: int  # the same through the whole drive
+    line: int  # persistent over the drive
     kind: str  # of LINE_KINDS
     points_m: Floats  # (N, 2) in ego
 
 
 class DemoRecording(Recording):
-    """The shipped drive, or another of its kind in `directory`. Raises DatasetError where it can't be read."""
+    """The shipped drive, or another one in `directory`. Raises DatasetError if it can't be read."""
 
     def __init__(self, directory: Path = DIRECTORY, camera: Camera | None = None, stride: int = 1) -> None:
         self.name = NAME if directory == DIRECTORY else directory.name
@@ -71,9 +71,9 @@ class DemoRecording(Recording):
                 images, ends, rate_hz, self._poses, self._ground, self._bodies = (file[name] for name in _ARRAYS)
                 self._lines = file.get("lines")
         except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile, zlib.error) as error:
-            raise DatasetError(f"{path}: is no drive of the built-in world: {error}") from None
+            raise DatasetError(f"{path}: not a drive of the built-in world: {error}") from None
         if not (len(ends) == len(self._poses) == len(self._ground) > 0 and int(ends[-1]) == len(images)):
-            raise DatasetError(f"{path}: its images, poses and ground planes do not belong together")
+            raise DatasetError(f"{path}: numbers of images, poses and ground planes differ")
         self.camera = camera or load_camera(directory / "camera.toml")
         self._images, self._starts, self._ends = images, np.concatenate([[0], ends[:-1]]), ends
         self._path, self._stride, self._source_hz = path, stride, float(rate_hz)
@@ -83,7 +83,7 @@ class DemoRecording(Recording):
         return -(-len(self._ends) // self._stride)
 
     def frames(self, start: int = 0) -> Iterator[RecordedFrame]:
-        """Every frame in order, decoded when asked for."""
+        """Yields the frames in order; images are decoded on demand."""
         for index in range(start, len(self)):
             number = index * self._stride
             t_ns = round(number * NS_PER_S / self._source_hz)
@@ -94,16 +94,16 @@ class DemoRecording(Recording):
                 yield RecordedFrame(index, t_ns, image)  # type: ignore[arg-type]
 
     def truth_poses(self) -> Floats:
-        """(N, 3, 4) rows of the camera against its first pose, in camera axes."""
+        """(N, 3, 4) camera poses relative to the first, in camera axes."""
         return self._poses[:: self._stride].astype(np.float64)
 
     def truth_ground(self, index: int) -> Ground:
-        """The camera over the road in a frame: its springs move it."""
+        """The camera over the road in a frame, moved by the car's suspension."""
         height_m, pitch_rad, roll_rad = (float(v) for v in self._ground[index * self._stride])
         return Ground(height_m=height_m, pitch_rad=pitch_rad, roll_rad=roll_rad)
 
     def truth_bodies(self, index: int) -> tuple[TrueBody, ...]:
-        """Every body whose box reaches into the image of a frame, occluded ones too."""
+        """All bodies with a box in the image of a frame, occluded ones too."""
         out = []
         for row in self._bodies[self._bodies[:, 0] == index * self._stride].astype(np.float64).tolist():
             _, body, label, x, y, yaw, length, width, height, vx, vy, visible, truncated, *box = row
@@ -117,11 +117,11 @@ class DemoRecording(Recording):
 
     @property
     def has_lines(self) -> bool:
-        """Whether the drive knows its true lines: the shipped one does not."""
+        """Whether the drive has true lines; the shipped one has none."""
         return self._lines is not None
 
     def truth_lines(self, index: int) -> tuple[TrueLine, ...]:
-        """Every line around the ego in a frame. Raises DatasetError where the drive has none."""
+        """All lines around the ego in a frame. Raises DatasetError if the drive has none."""
         if self._lines is None:
             raise DatasetError(f"{self._path}: has no true lines: render it again (`python -m perf roads --keep DIR`)")
         rows = self._lines[self._lines[:, 0] == index * self._stride].astype(np.float64)
@@ -140,7 +140,7 @@ def write_drive(
     bodies: Floats,
     lines: Floats | None = None,
 ) -> None:
-    """Write `drive.npz`: WebP images, (N, 3, 4) poses, (N, 3) height, pitch, roll, rows of COLUMNS, LINE_COLUMNS."""
+    """Writes `drive.npz`: WebP images, (N, 3, 4) poses, (N, 3) height, pitch, roll, rows of COLUMNS, LINE_COLUMNS."""
     directory.mkdir(parents=True, exist_ok=True)
     joined = np.frombuffer(b"".join(images), np.uint8)
     ends = np.cumsum([len(image) for image in images], dtype=np.int64)

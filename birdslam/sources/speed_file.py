@@ -1,8 +1,8 @@
-"""Speeds of the car beside a recording, as a text file.
+"""Vehicle speeds for a recording as a text file.
 
-A line is a time in s by the recording's clock and a speed in m/s, then, where the car says more, the 1-sigma of the
-speed in m/s, a yaw rate in rad/s (counter-clockwise) and its 1-sigma; by commas (a cell may be empty) or blanks, with
-`#` comments. A first line that names its columns may have them in any order: speed_tables.py.
+A line has a time in s in the recording's clock and a speed in m/s, then optionally the 1-sigma of the speed in m/s, a
+yaw rate in rad/s (counter-clockwise) and its 1-sigma; separated by commas (a cell may be empty) or blanks, with `#`
+comments. With a header line the columns may have any order: speed_tables.py.
 """
 
 from __future__ import annotations
@@ -20,51 +20,53 @@ from birdslam.sources.speed_log import SpeedLog
 from birdslam.sources.speed_tables import fix_speeds, names_columns, table_readings
 from birdslam.types import NS_PER_S, SpeedReading
 
-# 1-sigma where a file states none; a judgement: some steps of a wheel sensor's message (often 0.1 km/h), and
-# the bias of a stability control's gyroscope (0.6 degrees a second).
+# 1-sigma if a file states none: some steps of a wheel speed message (often 0.1 km/h), and the bias of a stability
+# control's gyroscope (0.6 degrees per second)
 SIGMA_MPS = 0.1
 YAW_RATE_SIGMA_RADPS = 0.01
 
 _MAX_COLUMNS = 5
-_MAX_S = 9e9  # a time in ns has 63 bits
+_MAX_S = 9e9  # ns since 1970 exceed int64 above this
 
 
 def read_speeds(path: Path, begin_ns: int = 0) -> SpeedLog:
-    """The readings of a file in its order, unchecked: the method rejects those of a faulty sensor (NaN, backwards in
-    time). `begin_ns` is the recording's first time, for tracks in UTC.
+    """Readings of a file in its order, unchecked: the method rejects faulty ones (NaN, times that do not increase).
 
-    Raises DatasetError for a file that can't be read, an invalid line, and an empty file.
+    `begin_ns`: the recording's first time, for tracks in UTC. Raises DatasetError for a file that is unreadable or
+    empty, and for an invalid line.
     """
     readings = [reading for _, reading in _lines(path, begin_ns)]
     if not readings:
-        raise DatasetError(f"{path}: holds no speeds")
+        raise DatasetError(f"{path}: no speeds")
     return SpeedLog(readings)
 
 
 def read_speed_curve(path: Path) -> Floats:
-    """(N, 2) of a file: time in s, growing, and speed in m/s. Raises DatasetError where a line is no car's."""
+    """(N, 2) time in s, increasing, and speed in m/s. Raises DatasetError for an implausible line."""
     lines = list(_lines(path))
     for number, reading in lines:
         if not 0.0 <= reading.speed_mps < 150.0:
             t_s = reading.t_ns / NS_PER_S
-            raise DatasetError(f"{path}: line {number}: {reading.speed_mps:g} m/s at {t_s:g} s is no speed of a car")
+            raise DatasetError(
+                f"{path}: line {number}: {reading.speed_mps:g} m/s at {t_s:g} s is not the speed of a car"
+            )
     for (_, before), (number, after) in pairwise(lines):
         if after.t_ns <= before.t_ns:
-            raise DatasetError(f"{path}: line {number} is not later than the time before it")
+            raise DatasetError(f"{path}: line {number} is not later than the previous time")
     if len(lines) < 2:
-        raise DatasetError(f"{path}: holds {len(lines)} speeds, 2 are needed")
+        raise DatasetError(f"{path}: has {len(lines)} speeds, needs 2")
     return np.array([(reading.t_ns / NS_PER_S, reading.speed_mps) for _, reading in lines])
 
 
 def of_sequence(path: Path, name: str) -> Path:
-    """The file of a sequence: in a directory NAME.txt."""
+    """The file of a sequence: NAME.txt in a directory."""
     return path / f"{name}.txt" if path.is_dir() else path
 
 
 def with_speeds(recording: Recording, path: Path) -> Recording:
-    """The recording with the car's speeds of a file in place of its own.
+    """Replaces the recording's speeds by those of a file.
 
-    Raises DatasetError, also where all the file's times lie outside the recording's: then they are of another clock.
+    Raises DatasetError, also if all its times are outside the recording's (another clock).
     """
     first = next(iter(recording.frames()), None)
     log = read_speeds(path, 0 if first is None else first.t_source_ns)
@@ -75,7 +77,7 @@ def with_speeds(recording: Recording, path: Path) -> Recording:
 
 
 def _lines(path: Path, begin_ns: int = 0) -> Iterator[tuple[int, SpeedReading]]:
-    """Number and reading of each line that holds one. Raises DatasetError."""
+    """Number and reading of each line with a reading. Raises DatasetError."""
     try:
         data = path.read_bytes()
         text = data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
@@ -95,13 +97,13 @@ def _lines(path: Path, begin_ns: int = 0) -> Iterator[tuple[int, SpeedReading]]:
             yield number, _reading(text.split(",") if "," in text else text.split())
         except ValueError:
             raise DatasetError(
-                f"{path}: line {number} is no time in s and speed in m/s (with or without sigma, yaw rate and its "
+                f"{path}: line {number} is not a time in s and a speed in m/s (optionally sigma, yaw rate and its "
                 f"sigma): {line[:40]!r}"
             ) from None
 
 
 def _of_track(path: Path, data: bytes, begin_ns: int) -> Iterator[tuple[int, SpeedReading]]:
-    """The speeds of a GPX or NMEA track: those that it states, else those between its fixes."""
+    """Speeds of a GPX or NMEA track: stated ones, else those between its fixes."""
     try:
         fixes = read_fixes(data, str(path), begin_ns)
     except GnssError as error:
@@ -110,7 +112,7 @@ def _of_track(path: Path, data: bytes, begin_ns: int) -> Iterator[tuple[int, Spe
 
 
 def _reading(words: list[str]) -> SpeedReading:
-    """Raises ValueError for what is no reading."""
+    """Parses a reading. Raises ValueError."""
     t_s, speed_mps, *rest = (float(word) if word.strip() else None for word in words)
     if t_s is None or speed_mps is None or not abs(t_s) < _MAX_S or len(words) > _MAX_COLUMNS:
         raise ValueError

@@ -1,4 +1,4 @@
-"""Tables of speeds with named columns, as loggers and GPS receivers write them."""
+"""Tables of vehicle speeds with named columns, as written by loggers and GPS receivers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from birdslam.sources.recording import DatasetError
 from birdslam.types import NS_PER_S, SpeedReading
 
-# Column -> what it is, and its unit in ours
+# Column -> quantity and factor to our unit
 _COLUMNS: Mapping[str, tuple[str, float]] = {
     **dict.fromkeys(("time_s", "t_s", "time", "t", "timestamp_s", "seconds"), ("time", 1.0)),
     **dict.fromkeys(("speed_mps", "speed", "velocity_mps", "v_mps"), ("speed", 1.0)),
@@ -22,24 +22,24 @@ _COLUMNS: Mapping[str, tuple[str, float]] = {
     **dict.fromkeys(("latitude_deg", "latitude", "lat"), ("latitude", 1.0)),
     **dict.fromkeys(("longitude_deg", "longitude", "lon", "lng"), ("longitude", 1.0)),
 }
-GPS_SIGMA_MPS = 0.3  # of a receiver's speed: many state whole km/h, some tenths of a second late
-_FIX_SIGMA_M = 1.0  # of the way between two fixes: five decimals of a degree
+GPS_SIGMA_MPS = 0.3  # of a receiver's speed: often whole km/h, some tenths of a second late
+_FIX_SIGMA_M = 1.0  # of the distance between two fixes: five decimals of a degree
 _YAW_RATE_SIGMA_RADPS = 0.01
 _SPEED_SIGMA_MPS = 0.1
-_Row = tuple[int, dict[str, float]]  # a line's number, and what it holds
+_Row = tuple[int, dict[str, float]]  # line number, values by quantity
 _EARTH_M = 6_371_000.0
-_SPARSE_NS = 250_000_000  # readings that are farther apart are filled up
-_LONGEST_GAP_NS = 3 * NS_PER_S  # over a longer one nothing is known
-_FILLED_NS = 100_000_000
+_MIN_GAP_NS = 250_000_000  # larger gaps between readings are interpolated
+_MAX_GAP_NS = 3 * NS_PER_S  # larger gaps are not interpolated
+_INTERPOLATED_NS = 100_000_000
 
 
 def names_columns(line: str) -> bool:
-    """Whether a line is a table's head: a time among its names, and no numbers."""
+    """Whether a line is a table's header: it names a time and has no numbers."""
     return any(_COLUMNS.get(word, ("", 0.0))[0] == "time" for word in _cells(line.lower()))
 
 
 def table_readings(path: Path, lines: Sequence[tuple[int, str]]) -> Iterator[tuple[int, SpeedReading]]:
-    """Number and reading of each line (number, text) below the head. Without a column of speed, by the GPS fixes.
+    """Line number and reading of each line (number, text) below the header. Without a speed column, from GPS fixes.
 
     Raises DatasetError.
     """
@@ -47,7 +47,7 @@ def table_readings(path: Path, lines: Sequence[tuple[int, str]]) -> Iterator[tup
     columns = {_COLUMNS[word][0]: (at, _COLUMNS[word][1]) for at, word in enumerate(head) if word in _COLUMNS}
     by_fixes = "speed" not in columns
     if by_fixes and not {"latitude", "longitude"} <= set(columns):
-        raise DatasetError(f"{path}: line {lines[0][0]}: names neither a speed (speed_mps, speed_kmh) nor GPS fixes")
+        raise DatasetError(f"{path}: line {lines[0][0]}: has no column of speed (speed_mps, speed_kmh) or GPS fixes")
     rows: list[_Row] = []
     for number, text in lines[1:]:
         cells = _cells(text)
@@ -56,31 +56,29 @@ def table_readings(path: Path, lines: Sequence[tuple[int, str]]) -> Iterator[tup
             if "time" not in rows[-1][1]:
                 raise ValueError
         except (ValueError, IndexError):
-            raise DatasetError(
-                f"{path}: line {number} does not hold what the first line names: {text[:40]!r}"
-            ) from None
+            raise DatasetError(f"{path}: line {number} does not match the header: {text[:40]!r}") from None
     if by_fixes:
-        yield from _filled_up(_by_fixes(rows))
+        yield from _interpolate(_fix_speeds(rows))
     elif "latitude" in columns:
-        yield from _filled_up(_by_speeds(rows, GPS_SIGMA_MPS))
+        yield from _interpolate(_stated_speeds(rows, GPS_SIGMA_MPS))
     else:
-        yield from _by_speeds(rows, _SPEED_SIGMA_MPS)
+        yield from _stated_speeds(rows, _SPEED_SIGMA_MPS)
 
 
 def fix_speeds(fixes: Sequence[tuple[int, float, float, float | None]]) -> Iterator[tuple[int, SpeedReading]]:
-    """Number and reading of GNSS fixes: time in ns, latitude and longitude in degrees, and a speed where one is stated.
+    """Line number and reading from GNSS fixes: time in ns, latitude and longitude in degrees, and speed or None.
 
-    Where fewer than half of them state one, the speeds are those between the fixes.
+    If fewer than half state a speed, the speeds are those between the fixes.
     """
     rows: list[_Row] = []
     for number, (t_ns, latitude_deg, longitude_deg, speed_mps) in enumerate(fixes, start=1):
         row = {"time": t_ns / NS_PER_S, "latitude": latitude_deg, "longitude": longitude_deg}
         rows.append((number, row if speed_mps is None else {**row, "speed": speed_mps}))
     stated = sum("speed" in row for _, row in rows)
-    yield from _filled_up(_by_speeds(rows, GPS_SIGMA_MPS) if 2 * stated > len(rows) else _by_fixes(rows))
+    yield from _interpolate(_stated_speeds(rows, GPS_SIGMA_MPS) if 2 * stated > len(rows) else _fix_speeds(rows))
 
 
-def _by_speeds(rows: Sequence[_Row], sigma_mps: float) -> Iterator[tuple[int, SpeedReading]]:
+def _stated_speeds(rows: Sequence[_Row], sigma_mps: float) -> Iterator[tuple[int, SpeedReading]]:
     for number, row in rows:
         if "speed" in row:
             yield (
@@ -95,17 +93,16 @@ def _by_speeds(rows: Sequence[_Row], sigma_mps: float) -> Iterator[tuple[int, Sp
             )
 
 
-def _filled_up(readings: Iterable[tuple[int, SpeedReading]]) -> Iterator[tuple[int, SpeedReading]]:
-    """Those of a GPS of 1 Hz at 10 Hz, by straight lines: a recording knows the next one.
+def _interpolate(readings: Iterable[tuple[int, SpeedReading]]) -> Iterator[tuple[int, SpeedReading]]:
+    """Interpolates readings of a 1 Hz GPS linearly to 10 Hz.
 
-    Between two readings the sigma has in it how far a car may have been off the line: 3 m/s2 by an eighth of their
-    time apart.
+    The sigma includes the deviation from the line at an acceleration of 3 m/s2: an eighth of that times the interval.
     """
     before: SpeedReading | None = None
     for number, after in readings:
         apart_ns = 0 if before is None else after.t_ns - before.t_ns
-        if before is not None and _SPARSE_NS < apart_ns <= _LONGEST_GAP_NS:
-            steps = math.ceil(apart_ns / _FILLED_NS)
+        if before is not None and _MIN_GAP_NS < apart_ns <= _MAX_GAP_NS:
+            steps = math.ceil(apart_ns / _INTERPOLATED_NS)
             off_mps = 3.0 / 8.0 * apart_ns / NS_PER_S
             for k in range(1, steps):
                 yield (
@@ -120,8 +117,8 @@ def _filled_up(readings: Iterable[tuple[int, SpeedReading]]) -> Iterator[tuple[i
         before = after
 
 
-def _by_fixes(rows: Sequence[_Row]) -> Iterator[tuple[int, SpeedReading]]:
-    """The mean speed between two fixes, halfway between them."""
+def _fix_speeds(rows: Sequence[_Row]) -> Iterator[tuple[int, SpeedReading]]:
+    """The mean speed between two fixes, at the middle of their times."""
     fixes = [(number, row) for number, row in rows if {"latitude", "longitude"} <= set(row)]
     for (_, a), (number, b) in pairwise(fixes):
         apart_s = b["time"] - a["time"]

@@ -9,7 +9,7 @@ from typing import Protocol
 import msgspec
 
 from birdslam.runtime.transport.bus import Message
-from birdslam.sources.speed_log import KEPT_NS, KEPT_READINGS, shifted
+from birdslam.sources.speed_log import MAX_AGE_NS, MAX_READINGS, shifted
 from birdslam.types import SpeedReading
 
 log = logging.getLogger(__name__)
@@ -25,11 +25,11 @@ class Readings(Protocol):
 
 
 class CarSpeeds:
-    """The readings that arrived in the last second, at most KEPT_READINGS."""
+    """The readings that arrived in the last second, at most MAX_READINGS."""
 
     def __init__(self, subscriber: Readings) -> None:
         self._subscriber = subscriber
-        self._recent: deque[tuple[int, SpeedReading]] = deque(maxlen=KEPT_READINGS)  # arrival on CLOCK_MONOTONIC
+        self._recent: deque[tuple[int, SpeedReading]] = deque(maxlen=MAX_READINGS)  # arrival on CLOCK_MONOTONIC
         self._taken = 0
         self._warned = False
 
@@ -38,7 +38,7 @@ class CarSpeeds:
 
         Readings arrive on CLOCK_MONOTONIC; a reading with time 0 gets its time of arrival.
         """
-        for _ in range(KEPT_READINGS):  # bounded, so that a flood of readings does not delay the frame
+        for _ in range(MAX_READINGS):  # bounded, so that a flood of readings does not delay the frame
             message = self._subscriber.recv(0.0)
             if message is None:
                 break
@@ -49,7 +49,7 @@ class CarSpeeds:
                 reading = shifted(reading, t_source_ns - t_capture_ns)
             self._recent.append((message.t_received_ns, reading))
             self._taken += 1
-        while self._recent and self._recent[0][0] <= t_capture_ns - KEPT_NS:
+        while self._recent and self._recent[0][0] <= t_capture_ns - MAX_AGE_NS:
             self._recent.popleft()
         if self._subscriber.dropped and not self._warned:
             self._warned = True

@@ -18,7 +18,7 @@ from birdslam.runtime.configuration import BudgetsConfig
 from birdslam.runtime.pages.tables import comments, table, unit
 from birdslam.runtime.topology import NODES, QUERIES, TOPICS, VERSION, Topic, alive_key, key_of
 from birdslam.runtime.wire import MAX_MESSAGE_BYTES, Part, Trace
-from birdslam.sources.speed_log import KEPT_READINGS
+from birdslam.sources.speed_log import MAX_READINGS
 from birdslam.types import INVALIDATING, Estimate, SpeedReading, Status
 
 _VEHICLE = "VEHICLE"
@@ -78,7 +78,7 @@ def page() -> str:
     return _PAGE.format(
         bytes=MAX_MESSAGE_BYTES,
         reading=_link(SpeedReading),
-        kept=KEPT_READINGS,
+        kept=MAX_READINGS,
         vehicle=_VEHICLE,
         version=VERSION,
         keys=table(_keys()),

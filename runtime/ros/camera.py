@@ -43,7 +43,7 @@ from birdslam.runtime.ros.session import ROUTER_S, NoRouter, RosNode
 from birdslam.sources.kitti import decode_image
 from birdslam.sources.recording import RecordedFrame
 from birdslam.sources.speed_file import SIGMA_MPS, YAW_RATE_SIGMA_RADPS
-from birdslam.sources.speed_log import KEPT_NS, KEPT_READINGS
+from birdslam.sources.speed_log import MAX_AGE_NS, MAX_READINGS
 from birdslam.types import NS_PER_S, SpeedReading
 
 NODE = "birdslam_camera"
@@ -110,7 +110,7 @@ class RosCamera:
         self._images: deque[Arrived] = deque(maxlen=RATE_FRAMES)
         self._infos: dict[str, Arrived] = {}
         self._transforms: list[Arrived] = []
-        self._readings: deque[tuple[int, SpeedReading]] = deque(maxlen=KEPT_READINGS)
+        self._readings: deque[tuple[int, SpeedReading]] = deque(maxlen=MAX_READINGS)
         self._problem = ""
         self._came = self._lost = self._number = 0  # received images, lost images, number of the newest
         self._closed = False
@@ -332,7 +332,7 @@ class RosCamera:
         except ValueError as error:
             return RecordedFrame(index, max(came.t_ns, last_ns + 1), None, f"{self.name}: image {index}: {error}")
         with self._arrived:
-            readings = tuple(reading for arrived_ns, reading in self._readings if arrived_ns > t_ns - KEPT_NS)
+            readings = tuple(reading for arrived_ns, reading in self._readings if arrived_ns > t_ns - MAX_AGE_NS)
         return RecordedFrame(index, t_ns, image, speeds=readings)
 
     def resume(self, frame_id: int, t_source_ns: int) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from birdslam.bench.baselines.trajectories import dead_reckoned
-from birdslam.lanes.amodal.lane_edges import LaneEdgesConfig, Station, stations
+from birdslam.lanes.amodal.lane_edges import LaneEdgesConfig, Station, fit_stations
 from birdslam.types import LandmarkKind, Measurements
 
 # Points of the completed lanes are thinned to one a cell, a few on a station's stretch
@@ -34,7 +34,7 @@ def with_completed_lanes(log: Sequence[Measurements]) -> list[Measurements]:
         if known:
             T_world_ego = ego[m.frame_id]
             points_m = T_world_ego @ np.array([[point.x_m, point.y_m] for point in known])
-            for landmark, point_m, along in stations(points_m, np.array([point.lane for point in known]), CONFIG):
+            for landmark, point_m, along in fit_stations(points_m, np.array([point.lane for point in known]), CONFIG):
                 across = np.array([-along[1], along[0]])
                 cov = np.outer(across, across) * CONFIG.sigma_across_m**2
                 cov += np.outer(along, along) * CONFIG.sigma_along_m**2

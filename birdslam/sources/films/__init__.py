@@ -1,1 +1,1 @@
-"""Films: their frames, and what their containers say beside them."""
+"""Film files: frames and container metadata."""

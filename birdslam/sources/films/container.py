@@ -1,8 +1,7 @@
-"""A film's file beside its pictures: why it does not open, and what an MP4 or MOV says of the lens.
+"""Container metadata of a film: why it does not open, and the focal length stated by an MP4 or MOV.
 
-MP4 and MOV files are boxes: four bytes of length, four of a name, then the content (ISO/IEC 14496-12). Apple's phones,
-and others after them, state how wide the lens saw as a focal length of the 35 mm format, among the metadata of
-QuickTime (`mdta` keys).
+MP4 and MOV files are boxes: four bytes of length, four of name, then the content (ISO/IEC 14496-12). Phones state a
+35 mm equivalent focal length among QuickTime's metadata (`mdta` keys).
 """
 
 from __future__ import annotations
@@ -16,23 +15,23 @@ from typing import NamedTuple
 
 from birdslam.sources.recording import DatasetError
 
-FULL_FRAME_MM = 36.0  # across
+FULL_FRAME_MM = 36.0  # width
 _FOCAL_KEY = re.compile(rb"focal_length.*35mm", re.IGNORECASE)
-_MAX_BYTES = 1 << 26  # of the index: an hour has some MB
-# Of a transport stream: packets, of a camera's with a time of four bytes before each, begin with the same byte
+_MAX_BYTES = 1 << 26  # of the index; an hour needs some MB
+# Transport streams: packets of 188 bytes, or 192 with a time of four bytes first, each with the same sync byte
 _PACKET_BYTES, _SYNC_BYTE, _SYNCED = {188: 0, 192: 4}, 0x47, 4
 _INSIDE = (b"moov", b"trak", b"udta", b"mdia")
-_STATED_MM = 5.0, 300.0  # what a focal length may be
+_STATED_MM = 5.0, 300.0  # range of a valid focal length
 
 
 class _Box(NamedTuple):
     name: bytes
-    begin: int  # of its content
+    begin: int  # of the content
     end: int
 
 
 def why_unreadable(path: Path) -> str:
-    """Why OpenCV can't open a file that is there, as far as its first bytes tell."""
+    """Why OpenCV cannot open an existing file, from its first bytes."""
     try:
         size, head = path.stat().st_size, _read(path, 0, 12)
     except OSError as error:
@@ -42,24 +41,26 @@ def why_unreadable(path: Path) -> str:
     if head[4:8] in (b"ftyp", b"mdat", b"moov", b"wide", b"free", b"skip"):
         names = [box.name for box in _boxes_of_file(path)]
         if b"moov" not in names:
-            return "is cut off: its index, which a camera writes last, is missing (power lost while it recorded?)"
-    return "is no video that OpenCV can open: no pictures in it, or of a codec that it has not"
+            return "is cut off: no index, which a camera writes last (power loss?)"
+    return "is not a video that OpenCV can open: no images in it, or an unknown codec"
 
 
 def is_raw_stream(path: Path) -> bool:
-    """Whether a file is H.264 or HEVC without a container (Annex B): it states no times of frames."""
+    """Whether a file is H.264 or HEVC without a container (Annex B), and so without frame times."""
     try:
         head = _read(path, 0, 5)
     except OSError:
         return False
     begin = 4 if head[:4] == b"\0\0\0\1" else 3
-    program_stream = head[:4] in (b"\0\0\1\xba", b"\0\0\1\xb3")  # MPEG-1 and MPEG-2 state their times
+    program_stream = head[:4] in (b"\0\0\1\xba", b"\0\0\1\xb3")  # MPEG-1 and MPEG-2 have times
     return head[begin - 3 : begin] == b"\0\0\1" and len(head) > begin and not program_stream
 
 
 def is_torn(path: Path) -> bool:
-    """Whether an MPEG transport stream (ISO/IEC 13818-1) ends within a packet: it states no length, so that one that
-    was cut off looks whole. False of other files, and where it can't be read."""
+    """Whether an MPEG transport stream (ISO/IEC 13818-1) ends within a packet, since it states no length.
+
+    False for other and for unreadable files.
+    """
     try:
         size, head = path.stat().st_size, _read(path, 0, _SYNCED * max(_PACKET_BYTES))
     except OSError:
@@ -71,9 +72,9 @@ def is_torn(path: Path) -> bool:
 
 
 def stated_focal_rel(path: Path) -> float | None:
-    """The focal length as a fraction of the picture's long side, where an MP4 or MOV states it; else None.
+    """The focal length over the image's long side if an MP4 or MOV states it, else None.
 
-    Of the 35 mm format, whose pictures are 36 mm wide; a film may show less than the whole sensor.
+    It is the 35 mm equivalent, for images 36 mm wide; a film may use less than the whole sensor.
     """
     if path.suffix.lower() not in (".mp4", ".mov", ".m4v"):
         return None
@@ -96,12 +97,12 @@ _CAMERA = re.compile(
 
 
 def natural(path: Path) -> list[tuple[int, int | str]]:
-    """Sorts names with numbers as people do: film2 before film10."""
+    """Sort key for names with numbers: film2 before film10."""
     return [(0, int(part)) if part.isdigit() else (1, part.lower()) for part in re.split(r"(\d+)", path.name) if part]
 
 
 def films_in(path: Path, suffixes: tuple[str, ...]) -> list[Path]:
-    """A film's file, or those of a directory or of a pattern (`DIR/*front*`) in natural order. Raises DatasetError."""
+    """The film, or the films of a directory or pattern (`DIR/*front*`) in natural order. Raises DatasetError."""
     if path.is_dir():
         found: Iterable[Path] = path.iterdir()
     elif "*" in path.name and not path.exists():
@@ -111,7 +112,7 @@ def films_in(path: Path, suffixes: tuple[str, ...]) -> list[Path]:
     films = sorted((file for file in found if file.suffix.lower() in suffixes), key=natural)
     films = [film for film in films if film.is_file() and not film.name.startswith(".")]  # ._ files of macOS
     if not films:
-        raise DatasetError(f"{path}: has no films ({', '.join(suffixes)})")
+        raise DatasetError(f"{path}: no films ({', '.join(suffixes)})")
     cameras = {camera: film for film in films if (camera := camera_of_name(film))}
     if len(cameras) > 1:
         pattern = (path if path.is_dir() else path.parent) / f"*{next(iter(cameras))}{films[0].suffix}"
@@ -121,13 +122,13 @@ def films_in(path: Path, suffixes: tuple[str, ...]) -> list[Path]:
 
 
 def camera_of_name(path: Path) -> str:
-    """The camera that a file name ends with, as recorders with several cameras write it; "": none."""
+    """The camera at the end of a file name, as recorders with several cameras write it; "": none."""
     found = _CAMERA.search(path.stem)
     return (found[1] or found[2]) if found else ""
 
 
 def _boxes_of_file(path: Path) -> Iterator[_Box]:
-    """The outermost boxes, as far as the file goes."""
+    """The top-level boxes up to the end of the file."""
     size, at = path.stat().st_size, 0
     while at + 8 <= size:
         length, name, header = _header(_read(path, at, 16), size - at)
@@ -138,7 +139,7 @@ def _boxes_of_file(path: Path) -> Iterator[_Box]:
 
 
 def _header(head: bytes, rest: int) -> tuple[int, bytes, int]:
-    """Length of a box with its header, its name, and the length of the header."""
+    """Length of a box with its header, its name, and the length of its header."""
     length, name = int.from_bytes(head[:4], "big"), head[4:8]
     if length == 1 and len(head) >= 16:
         return int.from_bytes(head[8:16], "big"), name, 16
@@ -155,7 +156,7 @@ def _boxes(data: bytes, begin: int, end: int) -> Iterator[_Box]:
 
 
 def _focal_mm(moov: bytes) -> float | None:
-    """Searches the metadata of the film and of its tracks."""
+    """Searches the metadata of the film and its tracks."""
     waiting = [_Box(b"moov", 0, len(moov))]
     while waiting:
         box = waiting.pop()
@@ -170,7 +171,7 @@ def _focal_mm(moov: bytes) -> float | None:
 
 
 def _of_meta(data: bytes, meta: _Box) -> float | None:
-    """`keys` names what `ilst` holds, by number. QuickTime's meta begins with boxes, MPEG's with a version."""
+    """`keys` names the entries of `ilst` by number. QuickTime's meta starts with boxes, MPEG's with a version."""
     skip = 0 if data[meta.begin + 4 : meta.begin + 8] in (b"hdlr", b"keys", b"mhdr") else 4
     parts = {box.name: box for box in _boxes(data, meta.begin + skip, meta.end)}
     if b"keys" not in parts or b"ilst" not in parts:
@@ -186,7 +187,7 @@ def _of_meta(data: bytes, meta: _Box) -> float | None:
 
 
 def _number(value: bytes) -> float | None:
-    """Of a `data` box: its type, its locale, then a text, a whole number or a float."""
+    """Parses a `data` box: type, locale, then a text, an integer or a float."""
     kind, content = int.from_bytes(value[1:4], "big"), value[8:]
     try:
         if kind == 1:

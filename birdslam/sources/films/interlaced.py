@@ -1,7 +1,6 @@
-"""Interlaced H.264 films, which some builds of OpenCV decode to nothing without a word (libswscale since FFmpeg 8).
+"""Detects interlaced H.264 films, which some builds of OpenCV decode to nothing without an error (FFmpeg 8).
 
-What tells them is the sequence parameter set (ISO/IEC 14496-10, 7.3.2.1): `frame_mbs_only_flag` is 0 where an image may
-hold two half images of different times.
+In the sequence parameter set (ISO/IEC 14496-10, 7.3.2.1) `frame_mbs_only_flag` is 0 if a frame may have two fields.
 """
 
 from __future__ import annotations
@@ -10,18 +9,18 @@ from pathlib import Path
 
 import cv2
 
-_SEARCHED_BYTES = 1 << 20  # at a film's begin and at its end
+_SEARCHED_BYTES = 1 << 20  # at the start and the end of a film
 _HIGH_PROFILES = {44, 83, 86, 100, 110, 118, 122, 128, 138, 139, 134, 135, 244}
-_ALIKE_IMAGES = 3
+_TESTED_IMAGES = 3
 
 
 def is_undecoded(path: Path) -> bool:
-    """Whether a film is interlaced and OpenCV leaves its images as they were before they were asked for."""
-    return may_be_interlaced(path) and _stays_the_same(path)
+    """Whether a film is interlaced and OpenCV does not write its images."""
+    return may_be_interlaced(path) and _leaves_images_unchanged(path)
 
 
 def may_be_interlaced(path: Path) -> bool:
-    """By the first sequence parameter set that is found; False where there is none."""
+    """From the first sequence parameter set; False without one."""
     size = path.stat().st_size
     with path.open("rb") as file:
         data = file.read(_SEARCHED_BYTES)
@@ -37,16 +36,16 @@ def may_be_interlaced(path: Path) -> bool:
         return False
 
 
-def _stays_the_same(path: Path) -> bool:
+def _leaves_images_unchanged(path: Path) -> bool:
     capture = cv2.VideoCapture(str(path))
-    images = [capture.read()[1] for _ in range(_ALIKE_IMAGES)]
+    images = [capture.read()[1] for _ in range(_TESTED_IMAGES)]
     capture.release()
     shown = {image.tobytes() for image in images if image is not None}
     return len(shown) == 1 and all(image is not None for image in images)
 
 
 class _Bits:
-    """Reads bits, and Exp-Golomb codes (9.1). Raises IndexError at the end."""
+    """Reads bits and Exp-Golomb codes (9.1). Raises IndexError at the end."""
 
     def __init__(self, data: bytes) -> None:
         self._data, self._at = data, 0
@@ -66,7 +65,7 @@ class _Bits:
 
 
 def _frame_mbs_only(bits: _Bits) -> bool:
-    """Raises ValueError for scaling matrices, which no camera here has."""
+    """Raises ValueError for scaling matrices, which are not supported."""
     profile = bits.bits(8)
     bits.bits(16)  # constraints, level
     bits.ue()  # number of the set

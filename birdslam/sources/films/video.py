@@ -1,4 +1,4 @@
-"""Films as recorded drives, through OpenCV: one file, or a directory of those that a camera wrote in turn."""
+"""Films as recorded drives through OpenCV: one file, or a directory of successive files of one camera."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from birdslam.sources.recording import DatasetError, RecordedFrame, Recording
 from birdslam.sources.schemes import VIDEO
 from birdslam.types import NS_PER_S
 
-GAP_NS = NS_PER_S  # a longer time between two frames is reported as a frame without an image
-NAME_RESOLUTION_S = 2.0  # names tell times by the second, and each of two may be rounded
-OVERLAP_S = 3.0  # the longest overlap of two films that is searched for
+GAP_NS = NS_PER_S  # a longer gap between frames is reported as a frame without an image
+NAME_RESOLUTION_S = 2.0  # times in names have a resolution of a second, and each of two may be rounded
+MAX_OVERLAP_S = 3.0  # max. searched overlap of two films
 OVERLAP_FRAMES = 5  # consecutive frames that must agree
 _MAX_DIFFERENCE, _MAX_DIFFERENCE_REL = 8.0, 0.5  # mean, in grey levels, and relative to the best other part
-_COUNTED = (".mp4", ".mov", ".m4v", ".avi", ".3gp")  # containers that say how many frames there are
-_USUAL_HZ = 1.0, 240.0  # a rate that a container states outside of these is measured
+_COUNTED_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".3gp")  # containers that state the number of frames
+_VALID_HZ = 1.0, 240.0  # outside, a stated rate is measured instead
 _MEASURED_FRAMES = 24
 # 20240131_235959, 2024-01-31 23.59.59 and the like
 _NAME_TIME = re.compile(r"(20\d\d)[-_.]?(\d\d)[-_.]?(\d\d)[-_. T]{0,3}(\d\d)[-_.:h]?(\d\d)[-_.:m]?(\d\d)")
@@ -38,11 +38,11 @@ _NAME_TIME = re.compile(r"(20\d\d)[-_.]?(\d\d)[-_.]?(\d\d)[-_. T]{0,3}(\d\d)[-_.
 
 @dataclass(frozen=True)
 class _Film:
-    """One file: what its container declares, and when it begins after the one before it has ended."""
+    """A file: metadata of its container, and its gap to the file before."""
 
     path: Path
     rate_hz: float
-    declared: int  # frames; 0: nothing is declared
+    declared: int  # frames; 0: not declared
     gap_ns: int = 0
 
     @property
@@ -54,38 +54,37 @@ class _Film:
         return self.declared / self.rate_hz
 
     def ends_early(self, frames: int, last_s: float) -> bool:
-        """Whether it holds less than is declared, having given so many frames, the last at that time."""
-        if self.path.suffix.lower() in _COUNTED:
-            return frames < 0.99 * self.declared - 1.0  # some containers miscount by a frame
-        return last_s < 0.98 * self.length_s - 0.5  # the count is the time by the mean rate
+        """Whether it has fewer frames than declared, given the frames read and the time of the last."""
+        if self.path.suffix.lower() in _COUNTED_SUFFIXES:
+            return frames < 0.99 * self.declared - 1.0  # some containers miscount by one
+        return last_s < 0.98 * self.length_s - 0.5  # the count is the duration times the mean rate
 
 
 class VideoRecording(Recording):
-    """A film, or the films of a directory in their natural order as one drive.
+    """A film, or the films of a directory in natural order as one drive.
 
-    Frames have the container's own times, also where those are uneven, and stand upright as a phone's film says.
-    `len` is what the containers declare (0 where one declares nothing). Films follow each other without a gap, but
-    where their names tell times that leave one. Where a film begins with the last frames of the one before, these are
-    left out. A gap of more than a second, there or within a film, is one frame
-    without an image.
+    Frames have the container's times, also uneven ones, and the container's rotation. `len` is the declared number of
+    frames (0 if one film declares none). Films follow each other without a gap unless the times in their names leave
+    one. Frames at the start of a film that repeat the end of the film before are left out. A gap above a second, there
+    or within a film, is one frame without an image.
     """
 
     def __init__(self, path: Path, camera: Camera | None, stride: int = 1) -> None:
         files = films_in(path, VIDEO.suffixes)
         for file in files if camera is None else ():
-            _capture(file).release()  # what is wrong with the film goes before what it lacks
+            _capture(file).release()  # errors of the film come before a missing camera
         if camera is None:
             raise DatasetError(
-                f"video:{path}: a film knows nothing of its camera: a camera file is needed (`birdslam run` without "
-                "--camera finds it)"
+                f"video:{path}: a film does not state its camera; give a camera file (`birdslam run` without "
+                "--camera estimates it)"
             )
         self.camera, self._stride, self.name = camera, stride, path.stem
-        self._films = _in_sequence([_film(file, camera) for file in files])
+        self._films = _with_gaps([_film(file, camera) for file in files])
         self.rate_hz = self._films[0].rate_hz / stride
 
     @classmethod
     def frame_size(cls, path: Path, topics: BagTopics) -> tuple[int, int]:
-        """As it is shown: a film that a phone took upright is higher than wide. Raises DatasetError."""
+        """Size as displayed: a film in portrait orientation is higher than wide. Raises DatasetError."""
         capture = _capture(films_in(path, VIDEO.suffixes)[0])
         size = _size(capture)
         capture.release()
@@ -93,7 +92,7 @@ class VideoRecording(Recording):
 
     @classmethod
     def stated_focal_px(cls, path: Path) -> float | None:
-        """The focal length by the container's metadata, of the whole sensor; None where it does not say."""
+        """The focal length from the container's metadata, of the whole sensor; None if not stated."""
         focal_rel = stated_focal_rel(films_in(path, VIDEO.suffixes)[0])
         return None if focal_rel is None else focal_rel * max(cls.frame_size(path, BagTopics()))
 
@@ -102,13 +101,13 @@ class VideoRecording(Recording):
         return -(-sum(declared) // self._stride) if all(declared) else 0
 
     def frames(self, start: int = 0) -> Iterator[RecordedFrame]:
-        """Every frame in order, its time from the container; a file cut off ends with one unreadable frame."""
+        """Yields the frames in order with the container's times; a truncated file ends with an unreadable frame."""
         index, t_ns = 0, -self._films[0].period_ns
-        tail: deque[Floats] = deque(maxlen=1)  # the last frames of a film, small
+        tail: deque[Floats] = deque(maxlen=1)  # the last frames of a film, downsampled
         for film in self._films:
             begin_ns = t_ns + film.period_ns + film.gap_ns
             skipped = _overlap(film.path, list(tail)) if tail and not film.gap_ns else 0
-            tail = deque(maxlen=max(1, round(OVERLAP_S * film.rate_hz)))
+            tail = deque(maxlen=max(1, round(MAX_OVERLAP_S * film.rate_hz)))
             for frame in self._frames_of(film, index, begin_ns, t_ns, start, skipped, tail):
                 index, t_ns = frame.index + 1, frame.t_source_ns
                 if frame.index >= start:
@@ -124,9 +123,9 @@ class VideoRecording(Recording):
         skipped: int,
         tail: deque[Floats],
     ) -> Iterator[RecordedFrame]:
-        """One file's without its first `skipped`, numbered from `index` on; small ones are added to `tail`.
+        """Yields the frames of a file after its first `skipped`, numbered from `index`; adds small ones to `tail`.
 
-        Frames before `start` are not decoded to an image, but for the last ones, which `tail` needs.
+        Frames before `start` are not decoded, except the last ones, which `tail` needs.
         """
         followed = film is not self._films[-1]
         capture = _capture(film.path)
@@ -137,9 +136,10 @@ class VideoRecording(Recording):
                 stamp_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6) + shift_ns
                 if position < skipped:
                     position += 1
-                    shift_ns = begin_ns - (stamp_ns - shift_ns) - film.period_ns  # of the next frame, the first kept
+                    # of the next frame, the first one used
+                    shift_ns = begin_ns - (stamp_ns - shift_ns) - film.period_ns
                     continue
-                if stamp_ns <= t_ns:  # a clock that restarted, or a container without times, which gives zeros
+                if stamp_ns <= t_ns:  # a clock that restarted, or a container without times (zeros)
                     shift_ns += t_ns + film.period_ns - stamp_ns
                     stamp_ns = t_ns + film.period_ns
                 gap_ns, t_ns = (stamp_ns - t_ns if index else 0), stamp_ns
@@ -170,36 +170,37 @@ class VideoRecording(Recording):
 
 
 def _film(path: Path, camera: Camera) -> _Film:
-    """Opened once, to see that it fits. Raises DatasetError."""
+    """Opens a film to check that it fits. Raises DatasetError."""
     capture = _capture(path)
     rate_hz, size = capture.get(cv2.CAP_PROP_FPS), _size(capture)
     declared = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
-    if not _USUAL_HZ[0] <= rate_hz <= _USUAL_HZ[1]:  # not a number, too
-        declared = round(declared / rate_hz) if math.isfinite(rate_hz) and rate_hz > 0.0 else 0  # as seconds
-        rate_hz = _measured_hz(capture)
+    if not _VALID_HZ[0] <= rate_hz <= _VALID_HZ[1]:  # also NaN
+        # the value is a duration
+        declared = round(declared / rate_hz) if math.isfinite(rate_hz) and rate_hz > 0.0 else 0
+        rate_hz = _measure_hz(capture)
         declared = round(declared * rate_hz) if math.isfinite(rate_hz) else 0
     capture.release()
     if is_raw_stream(path):
         raise DatasetError(
-            f"{path}: a raw stream without the times of its frames; put it into a container at the camera's rate: "
+            f"{path}: a raw stream without frame times; put it into a container at the camera's rate: "
             f"ffmpeg -framerate HZ -i {path.name} -c copy film.mp4"
         )
     if is_undecoded(path):
         raise DatasetError(
-            f"{path}: is interlaced, which this OpenCV can't decode; make it progressive first: "
+            f"{path}: is interlaced, which this OpenCV cannot decode; make it progressive first: "
             f"ffmpeg -i {path.name} -vf yadif progressive.mp4"
         )
     if not (math.isfinite(rate_hz) and 0.0 < rate_hz <= 1000.0):
-        raise DatasetError(f"{path}: neither its container nor its frames tell a usable frame rate ({rate_hz:g})")
+        raise DatasetError(f"{path}: neither its container nor its frames have a usable frame rate ({rate_hz:g})")
     if size != (camera.width_px, camera.height_px):
         raise DatasetError(
-            f"{path}: is {size[0]}x{size[1]}, but the camera given is {camera.width_px}x{camera.height_px}"
+            f"{path}: is {size[0]}x{size[1]}, but the given camera is {camera.width_px}x{camera.height_px}"
         )
     return _Film(path, rate_hz, declared)
 
 
-def _measured_hz(capture: cv2.VideoCapture) -> float:
-    """By the times of the first frames; NaN where they have none."""
+def _measure_hz(capture: cv2.VideoCapture) -> float:
+    """Frame rate from the times of the first frames; NaN without times."""
     times: list[float] = []
     while len(times) < _MEASURED_FRAMES and capture.grab():
         times.append(capture.get(cv2.CAP_PROP_POS_MSEC))
@@ -207,8 +208,8 @@ def _measured_hz(capture: cv2.VideoCapture) -> float:
     return float(1e3 / np.median(steps)) if len(steps) and np.median(steps) > 0.0 else math.nan
 
 
-def _in_sequence(films: list[_Film]) -> list[_Film]:
-    """With the gaps that the times in their names leave between them."""
+def _with_gaps(films: list[_Film]) -> list[_Film]:
+    """The films with the gaps between the times in their names."""
     out = films[:1]
     for before, film in pairwise(films):
         began, begins = _name_time(before.path), _name_time(film.path)
@@ -221,15 +222,15 @@ def _in_sequence(films: list[_Film]) -> list[_Film]:
 
 
 def _small(image: NDArray[np.uint8]) -> Floats:
-    """Every 16th pixel of an image (one channel), to compare frames by."""
+    """Every 16th pixel of an image (one channel), for the comparison of frames."""
     return np.asarray(image[8::16, 8::16] if image.ndim == 2 else image[8::16, 8::16, 1], np.float64)
 
 
 def _overlap(path: Path, tail: Sequence[Floats]) -> int:
-    """Returns how many frames at the beginning of a film are the last ones of the film before, whose `tail` is given.
+    """Returns the number of frames at the start of a film that repeat the `tail` of the film before.
 
-    Its first frames are compared with every part of the tail. One part must agree far better than all that are not next
-    to it, which excludes a stationary camera.
+    Its first frames are compared with every part of the tail. One part must match far better than all parts that are
+    not its neighbours, which excludes a stationary camera.
     """
     capture, first = _capture(path), list[Floats]()
     while len(first) < OVERLAP_FRAMES and capture.grab():
@@ -253,14 +254,14 @@ def _name_time(path: Path) -> datetime | None:
     found = _NAME_TIME.search(path.stem)
     try:
         return datetime(*map(int, found.groups())) if found else None  # type: ignore[arg-type]
-    except ValueError:  # digits that are none
+    except ValueError:  # invalid digits
         return None
 
 
 def _capture(path: Path) -> cv2.VideoCapture:
-    """The film, opened. Raises DatasetError."""
+    """Opens a film. Raises DatasetError."""
     if not path.is_file():
-        raise DatasetError(f"{path}: {'is no file' if path.exists() else 'no such file'}")
+        raise DatasetError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
         raise DatasetError(f"{path}: {why_unreadable(path)}")
@@ -270,7 +271,7 @@ def _capture(path: Path) -> cv2.VideoCapture:
 def _size(capture: cv2.VideoCapture) -> tuple[int, int]:
     """Width and height of an image with square pixels, as read and rotated by OpenCV.
 
-    The sample aspect ratio (width over height of a pixel as coded) of anamorphic films widens the image.
+    The sample aspect ratio of anamorphic films widens the image.
     """
     width, height = capture.get(cv2.CAP_PROP_FRAME_WIDTH), capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
     over, under = capture.get(cv2.CAP_PROP_SAR_NUM), capture.get(cv2.CAP_PROP_SAR_DEN)
