@@ -37,7 +37,7 @@ from birdslam.vehicles.camera_height import BoxHeight, measure_heights
 
 Floats = NDArray[np.float64]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
-UNOBSERVED_RAD = 10.0  # 1-sigma of what is not observed
+UNOBSERVED_RAD = 10.0  # 1-sigma of an unobserved angle
 
 
 class CalibrationError(ValueError):
@@ -49,27 +49,27 @@ class CalibrationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
 
     vehicles: VehicleHeightConfig = VehicleHeightConfig()
     height: HeightCheckConfig = HeightCheckConfig()
-    min_path_m: Positive = 20.0  # of measured motion: less shows bounces of the car, not their mean
+    min_path_m: Positive = 20.0  # min. distance travelled: less gives bounces of the car instead of their mean
     min_fits: Annotated[int, msgspec.Meta(ge=3)] = 10
     bounce_m: Positive = 3.0  # correlation length of the car's bounce
     sigma_bounce_rad: Positive = 0.012
-    sigma_fit_rad: Positive = 0.004  # of one alignment: the road is no perfect plane
+    sigma_fit_rad: Positive = 0.004  # of one alignment: roads are not exact planes
     sigma_length_rel: Positive = 0.02  # of the running scale
-    sigma_curvature_per_m: Positive = 0.0006  # of roads lengthwise
-    sigma_road_rad: Positive = 0.002  # of their mean: crown and grade of the way driven
+    sigma_curvature_per_m: Positive = 0.0006  # longitudinal curvature of roads
+    sigma_road_rad: Positive = 0.002  # of their mean: crown and grade of the road driven
     straight_rad_per_m: Positive = 0.005
     sigma_direction_rad: Positive = 0.012  # of the direction of travel over one metre
-    sigma_travel_rad: Positive = 0.003  # of its mean: a car squats on its springs, and climbs a little
+    sigma_travel_rad: Positive = 0.003  # of its mean: suspension and grade
     crest_m: Positive = 30.0  # correlation length of crests and sags
     min_looks: Annotated[int, msgspec.Meta(ge=3)] = 5  # at the vanishing point
-    max_sigma_rad: Positive = 0.02  # of the result's pitch, which all lengths along the road rest on
-    max_sigma_roll_rad: Positive = 0.02  # of its roll: at the side of the own lane that is 4 cm of height
-    restart_rad: Positive = 0.01  # farther than this from the start's tilt, the drive is repeated from the result
+    max_sigma_rad: Positive = 0.02  # max. sigma of the resulting pitch, which all longitudinal distances depend on
+    max_sigma_roll_rad: Positive = 0.02  # max. sigma of the roll: at the side of the own lane it is 4 cm of height
+    restart_rad: Positive = 0.01  # max. distance from the initial tilt; above it the drive is repeated from the result
     max_drives: Annotated[int, msgspec.Meta(ge=1)] = 3
 
 
 class CueEstimate(msgspec.Struct, frozen=True, kw_only=True):
-    """(pitch_rad, roll_rad) by one cue, cov (2, 2); `chi2` of its distance from the mean of all cues."""
+    """(pitch_rad, roll_rad) from one cue with cov (2, 2); `chi2` is its squared distance from the mean of all cues."""
 
     cue: str
     pitch_rad: float
@@ -80,21 +80,21 @@ class CueEstimate(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Calibration(msgspec.Struct, frozen=True, kw_only=True):
-    """The calibrated camera, with cov (2, 2) of (pitch_rad, roll_rad) and what it is based on."""
+    """The calibrated camera with cov (2, 2) of (pitch_rad, roll_rad) and the estimates behind it."""
 
     camera: Camera
     cov: tuple[float, ...]
     estimates: tuple[CueEstimate, ...]
     height_checks: tuple[HeightCheck, ...]
-    yaw_rad: float | None  # of the optical axis, to the left of the direction of travel; not in the camera file
+    yaw_rad: float | None  # of the optical axis, left of the direction of travel; not in the camera file
     path_m: float
     frames: int
-    speed_mps: float  # median over the frames that showed their motion
-    assumed: str = ""  # why the tilt is none that the drive shows
+    speed_mps: float  # median over frames with a measured motion
+    assumed: str = ""  # reason why the tilt is assumed, "" if measured
 
 
 class _RecordingOdometry(Odometry):
-    """The front end's odometry, which keeps its last motion."""
+    """The front end's odometry; stores its last motion."""
 
     motion: Motion | None = None
 
@@ -103,7 +103,7 @@ class _RecordingOdometry(Odometry):
         return self.motion
 
     def take(self) -> Motion | None:
-        """The motion of the present frame, once."""
+        """The motion of the current frame, once."""
         motion, self.motion = self.motion, None
         return motion
 
@@ -112,8 +112,8 @@ class _RecordingOdometry(Odometry):
 class Observations:
     """Measurements of one drive."""
 
-    fits: list[tuple[RoadFit, float]] = field(default_factory=list)  # and the distance since the one before
-    directions: list[tuple[Floats, float]] = field(default_factory=list)  # of straight travel, and its length
+    fits: list[tuple[RoadFit, float]] = field(default_factory=list)  # with the distance since the previous one
+    directions: list[tuple[Floats, float]] = field(default_factory=list)  # of straight travel, with its length
     lines: list[VanishingPoint] = field(default_factory=list)
     steps: list[Step] = field(default_factory=list)
     boxes: list[BoxHeight] = field(default_factory=list)
@@ -127,7 +127,7 @@ class Observations:
 
     @property
     def speed_mps(self) -> float:
-        """The median; 0 without any motion."""
+        """The median speed; 0 without motion."""
         each = [length / (self.times_ns[to] - self.times_ns[of]) * NS_PER_S for of, to, length in self.steps]
         return float(np.median(each)) if each else 0.0
 
@@ -144,14 +144,13 @@ def calibrate(
 ) -> Calibration:
     """Calibrates from all frames of a drive, which is repeated if the initial tilt was far off.
 
-    `lengths` are known distances between two frames, by name of their source. Raises CalibrationError.
+    `lengths`: known distances between two frames, by name of their source. Raises CalibrationError.
     """
     for _ in range(config.max_drives):
         seen = _observe(drive, camera, frontend, config)
         if seen.path_m < config.min_path_m:
             raise CalibrationError(
-                f"too little motion: {seen.path_m:.1f} m measured in {seen.frames} frames, "
-                f"{config.min_path_m:g} m are needed"
+                f"too little motion: {seen.path_m:.1f} m in {seen.frames} frames, {config.min_path_m:g} m needed"
             )
         tilt, cov, estimates = _mean(_cue_estimates(seen, camera, config))
         moved = float(np.abs(tilt - [camera.pitch_rad, camera.roll_rad]).max())
@@ -163,8 +162,8 @@ def calibrate(
             break
     if sigma[0] > config.max_sigma_rad or sigma[1] > config.max_sigma_roll_rad:
         raise CalibrationError(
-            f"pitch and roll are known to {sigma[0]:.3f} and {sigma[1]:.3f} rad only, {config.max_sigma_rad:g} and "
-            f"{config.max_sigma_roll_rad:g} are the limits: too little of the road was seen"
+            f"pitch and roll have 1-sigma of {sigma[0]:.3f} and {sigma[1]:.3f} rad, {config.max_sigma_rad:g} and "
+            f"{config.max_sigma_roll_rad:g} are the limits: too little of the road is in view"
         )
     return Calibration(
         camera=camera,
@@ -220,7 +219,7 @@ def _cue_estimates(seen: Observations, camera: Camera, config: CalibrationConfig
     estimates = [estimate for estimate in found if estimate is not None]
     if not estimates:
         raise CalibrationError(
-            "neither the road nor its lines nor a straight way nor vehicles were seen: nothing shows the tilt"
+            "no cue for the tilt: no road, lines of the road, straight travel or vehicles were detected"
         )
     return estimates
 
@@ -229,8 +228,8 @@ def by_road(seen: Observations, camera: Camera, config: CalibrationConfig) -> Cu
     """Robust mean over the alignments of the road; those within bounce_m count as one sample."""
     if len(seen.fits) < config.min_fits:
         return None
-    # In each the tilt is correlated with the length of its step, which the running scale knows better, and with the
-    # road's curvature, which is small in the mean
+    # The tilt of each is correlated with the length of its step, which the running scale gives more precisely, and with
+    # the road's curvature, which is small in the mean
     known = np.diag([config.sigma_length_rel**-2, 0.0, 0.0, config.sigma_curvature_per_m**-2])
     own = np.linalg.inv([fit.cov for fit, _ in seen.fits])
     cov = np.linalg.inv(own + known)
@@ -247,14 +246,14 @@ def by_road(seen: Observations, camera: Camera, config: CalibrationConfig) -> Cu
         mean = np.linalg.solve(total, np.einsum("n,nij,nj->i", weights, info, tilt))
         away = np.sqrt(np.einsum("ni,nij,nj->n", tilt - mean, np.linalg.inv(noise), tilt - mean))
         weights = 1.0 / np.maximum(1.0, away / 1.5)  # Huber
-    # The running scale's error is systematic: it tilts all alignments alike and does not average out
+    # The error of the running scale is systematic: it tilts all alignments alike
     lasting = np.linalg.solve(total, np.einsum("n,nij,nj->i", weights, info, by_length)) * config.sigma_length_rel
     of_mean = np.linalg.inv(total) + np.outer(lasting, lasting) + np.eye(2) * config.sigma_road_rad**2
     return _cue_estimate("road", mean, of_mean, len(tilt))
 
 
 def _by_travel(seen: Observations, camera: Camera, config: CalibrationConfig) -> CueEstimate | None:
-    """A car travels along the road: normal . direction = 0, solved for the pitch at the roll known so far."""
+    """A car travels along the road: normal . direction = 0, solved for the pitch with the current roll."""
     length = np.array([length for _, length in seen.directions])
     if length.sum() < config.min_path_m:
         return None
@@ -264,7 +263,7 @@ def _by_travel(seen: Observations, camera: Camera, config: CalibrationConfig) ->
     order = np.argsort(pitch)
     cumulated = np.cumsum(length[order])
     centre = float(pitch[order[np.searchsorted(cumulated, 0.5 * cumulated[-1])]])  # the weighted median
-    # Bounces are correlated over bounce_m and turn the direction of the camera's travel back and forth
+    # Bounces are correlated over bounce_m and rotate the direction of travel back and forth
     variance = config.sigma_direction_rad**2 * max(1.0, config.bounce_m) / length.sum() + config.sigma_travel_rad**2
     return _cue_estimate(
         "travel", np.array([centre, 0.0]), np.diag([variance, UNOBSERVED_RAD**2]), len(pitch), sees_roll=False
@@ -272,13 +271,13 @@ def _by_travel(seen: Observations, camera: Camera, config: CalibrationConfig) ->
 
 
 def _by_lines(seen: Observations, camera: Camera, config: CalibrationConfig) -> CueEstimate | None:
-    """The road's lines lie in it: normal . direction = 0, solved for the pitch at the roll known so far."""
+    """The road's lines are in its plane: normal . direction = 0, solved for the pitch with the current roll."""
     if len(seen.lines) < config.min_looks:
         return None
     normal, by_pitch, _ = plane_normal(camera.pitch_rad, camera.roll_rad)
     directions = np.array([look.direction for look in seen.lines])
     pitch = float(np.median(camera.pitch_rad - (directions @ normal) / (directions @ by_pitch)))
-    # A crest turns the road where the lines are, a bounce the camera; both are correlated over several detections
+    # A crest tilts the road at the lines, a bounce the camera; both are correlated over several detections
     distance_m = float(np.median([look.distance_m for look in seen.lines]))
     lasting = config.sigma_bounce_rad**2 * config.bounce_m
     lasting += (config.sigma_curvature_per_m * distance_m) ** 2 * config.crest_m

@@ -44,7 +44,7 @@ FORMATS = "KITTI, ROS camera_info, OpenCV, Kalibr, ORB-SLAM3, COLMAP, nuScenes"
 
 
 def format_of(path: Path) -> str | None:
-    """The format of another project's camera file; None: none that is known, or the file can't be read."""
+    """The format of a camera file of another project; None if unknown or unreadable."""
     try:
         return _recognized(_text(path))
     except DatasetError:
@@ -52,7 +52,7 @@ def format_of(path: Path) -> str | None:
 
 
 def read_intrinsics(path: Path, key: str | None = None) -> Intrinsics:
-    """Reads the camera of a calibration file by its content; `key` names the projection matrix of a KITTI file."""
+    """Reads a calibration file of any known format; `key` names the projection matrix of a KITTI file."""
     text = _text(path)
     name = _recognized(text)
     if name == "KITTI" or key:
@@ -65,7 +65,7 @@ def read_intrinsics(path: Path, key: str | None = None) -> Intrinsics:
     if name == "nuScenes":
         return _nuscenes(path, tree)
     if not isinstance(tree, dict):
-        raise DatasetError(f"{path}: holds no camera; expected a file of {FORMATS}")
+        raise DatasetError(f"{path}: has no camera; expected a file of {FORMATS}")
     if name == "Kalibr":
         return _kalibr(path, tree)
     if name == "ORB-SLAM3":
@@ -99,24 +99,24 @@ def _recognized(text: str) -> str | None:
 
 
 class _Loader(yaml.SafeLoader):
-    """Plain YAML, and OpenCV's matrices as mappings."""
+    """Plain YAML with OpenCV's matrices as mappings."""
 
 
 _Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", lambda loader, node: loader.construct_mapping(node, True))
 
 
 def _tree(path: Path, text: str) -> Any:
-    if text.startswith("%YAML"):  # OpenCV writes "%YAML:1.0", which YAML does not know
+    if text.startswith("%YAML"):  # OpenCV writes "%YAML:1.0", which is not YAML
         text = text.partition("\n")[2]
     try:
-        # The first document: `rostopic echo` ends each message by "---"
+        # The first document: `rostopic echo` separates messages by "---"
         return next((document for document in yaml.load_all(text, _Loader) if document is not None), None)
     except (yaml.YAMLError, RecursionError, ValueError) as error:
-        raise DatasetError(f"{path}: no YAML: {' '.join(str(error).split())[:200]}") from None
+        raise DatasetError(f"{path}: not YAML: {' '.join(str(error).split())[:200]}") from None
 
 
 def _opencv_storage(path: Path, text: str) -> dict[str, Any]:
-    """Reads an XML file of cv2.FileStorage as `_tree` reads YAML."""
+    """Reads an XML file of cv2.FileStorage like `_tree` reads YAML."""
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         nodes = {name: storage.getNode(name) for name in storage.root().keys()}  # noqa: SIM118
@@ -130,7 +130,7 @@ def _opencv_storage(path: Path, text: str) -> dict[str, Any]:
                 tree[name] = matrix.ravel().tolist()
         return tree
     except (cv2.error, SystemError) as error:
-        raise DatasetError(f"{path}: no OpenCV storage: {' '.join(str(error).split())[:200]}") from None
+        raise DatasetError(f"{path}: not an OpenCV storage: {' '.join(str(error).split())[:200]}") from None
 
 
 def _kitti(path: Path, key: str | None) -> Intrinsics:
@@ -150,16 +150,16 @@ def _kitti(path: Path, key: str | None) -> Intrinsics:
 
 
 def _of_matrices(path: Path, tree: Mapping[str, Any]) -> Intrinsics:
-    """Of a ROS camera_info, or of OpenCV's calibration: a matrix, coefficients and a size under several names."""
+    """From ROS camera_info or OpenCV's calibration: matrix, coefficients and size under several names."""
     K = _numbers(path, tree, ("camera_matrix", "K", "k", "Camera_Matrix", "cameraMatrix", "intrinsic_matrix"))
     if K is None:
         raise DatasetError(f"{path}: has neither camera_matrix nor K; expected a file of {FORMATS}")
     if len(K) != 9:
         raise DatasetError(f"{path}: its camera matrix has {len(K)} numbers, not 9")
     if not any(K):
-        raise DatasetError(f"{path}: its camera matrix is zero: this camera was never calibrated")
+        raise DatasetError(f"{path}: its camera matrix is zero: the camera is not calibrated")
     if max(abs(K[i]) for i in (1, 3, 6, 7)) > 1e-6 * max(abs(K[0]), 1.0) or K[8] != 1.0:
-        raise DatasetError(f"{path}: its camera matrix has a skew, or is none: {K}")
+        raise DatasetError(f"{path}: its camera matrix is invalid or has a skew: {K}")
     keys = ("distortion_coefficients", "D", "d", "Distortion_Coefficients", "distortion", "distCoeffs", "dist_coeffs")
     distortion = _numbers(path, tree, keys) or []
     model = str(tree.get("distortion_model") or "")
@@ -180,13 +180,13 @@ def _of_matrices(path: Path, tree: Mapping[str, Any]) -> Intrinsics:
 
 
 def _kalibr(path: Path, tree: Mapping[str, Any]) -> Intrinsics:
-    """Of a camchain of Kalibr with one camera, or with several that are alike."""
+    """From a camchain of Kalibr with one camera or several equal ones."""
     cameras = {name: camera for name, camera in tree.items() if re.fullmatch(r"cam\d+", str(name))}
     if len(cameras) > 1:
-        raise DatasetError(f"{path}: has {len(cameras)} cameras; leave one in it ({', '.join(cameras)})")
+        raise DatasetError(f"{path}: has {len(cameras)} cameras; keep one of them ({', '.join(cameras)})")
     name, camera = next(iter(cameras.items()), ("", None))
     if not isinstance(camera, dict):
-        raise DatasetError(f"{path}: {name or 'it'} holds no camera")
+        raise DatasetError(f"{path}: {name or 'it'} has no camera")
     if (projection := str(camera.get("camera_model"))) != "pinhole":
         raise DatasetError(f"{path}: camera_model {projection} is not supported (only pinhole)")
     focal = _numbers(path, camera, ("intrinsics",)) or []
@@ -202,7 +202,7 @@ def _kalibr(path: Path, tree: Mapping[str, Any]) -> Intrinsics:
 
 
 def _orb_slam(path: Path, tree: Mapping[str, Any]) -> Intrinsics:
-    """Of a settings file of ORB-SLAM2 or ORB-SLAM3; `Camera1.` is the first camera of version 1.0."""
+    """From a settings file of ORB-SLAM2 or ORB-SLAM3; `Camera1.` is the first camera of version 1.0."""
     kind = str(tree.get("Camera.type") or "PinHole")
     if kind.lower() not in ("pinhole", "rectified", "kannalabrandt8"):
         raise DatasetError(f"{path}: Camera.type {kind} is not supported (only PinHole, Rectified, KannalaBrandt8)")
@@ -227,10 +227,10 @@ def _orb_slam(path: Path, tree: Mapping[str, Any]) -> Intrinsics:
 
 
 def _colmap(path: Path, text: str) -> Intrinsics:
-    """Of COLMAP's cameras.txt, whose pixels have their middle at half coordinates."""
+    """From COLMAP's cameras.txt, whose pixel centres have half coordinates."""
     rows = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if len({tuple(row[1:]) for row in rows}) > 1:
-        raise DatasetError(f"{path}: has {len(rows)} different cameras; leave one in it")
+        raise DatasetError(f"{path}: has {len(rows)} different cameras; keep one of them")
     _, model, *words = rows[0]
     if model not in COLMAP:
         raise DatasetError(f"{path}: camera model {model} is not supported (only {', '.join(COLMAP)})")
@@ -238,7 +238,7 @@ def _colmap(path: Path, text: str) -> Intrinsics:
     try:
         width, height, *parameters = (float(word) for word in words)
     except ValueError:
-        raise DatasetError(f"{path}: a camera's line holds something that is no number") from None
+        raise DatasetError(f"{path}: a camera's line contains a value that is not a number") from None
     expected = focals + 2 + sum(k is not None for k in order)
     if len(parameters) != expected or not np.isfinite(parameters).all() or min(width, height) < 1.0:
         raise DatasetError(f"{path}: {model} has {len(parameters)} parameters, not {expected}")
@@ -249,14 +249,14 @@ def _colmap(path: Path, text: str) -> Intrinsics:
 
 
 def _nuscenes(path: Path, tree: Any) -> Intrinsics:
-    """Of nuScenes' calibrated_sensor.json, or one entry of it; its images are undistorted."""
+    """From nuScenes' calibrated_sensor.json, or one entry of it; its images are undistorted."""
     entries = tree if isinstance(tree, list) else [tree]
     matrices = {json.dumps(entry["camera_intrinsic"]) for entry in entries if _has_matrix(entry)}
     if len(matrices) != 1:
-        raise DatasetError(f"{path}: has {len(matrices)} different cameras; leave the entry of one in it")
+        raise DatasetError(f"{path}: has {len(matrices)} different cameras; keep the entry of one")
     K = np.array(json.loads(matrices.pop()), np.float64)
     if K.shape != (3, 3) or not np.isfinite(K).all():
-        raise DatasetError(f"{path}: camera_intrinsic is no matrix of 3x3 numbers")
+        raise DatasetError(f"{path}: camera_intrinsic is not a matrix of 3x3 numbers")
     return _intrinsics(path, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]), (), False, None, None)
 
 
@@ -272,11 +272,11 @@ def _intrinsics(
     width_px: int | None,
     height_px: int | None,
 ) -> Intrinsics:
-    """`focal_px` is fx, fy, cx, cy. An equidistant lens bends the image with zeros too."""
+    """`focal_px` is fx, fy, cx, cy. An equidistant lens distorts also with zero coefficients."""
     if fisheye and len(distortion) > 4:
         raise DatasetError(f"{path}: a fisheye model has 4 coefficients, not {len(distortion)}")
     if min(focal_px[:2]) <= 0.0:
-        raise DatasetError(f"{path}: a focal length of {min(focal_px[:2]):g} px is none")
+        raise DatasetError(f"{path}: invalid focal length of {min(focal_px[:2]):g} px")
     if any(distortion) and not fisheye and len(distortion) not in COEFFICIENTS:
         counts = ", ".join(map(str, COEFFICIENTS))
         raise DatasetError(f"{path}: has {len(distortion)} distortion coefficients; OpenCV's models have {counts}")
@@ -303,7 +303,7 @@ def _numbers(path: Path, tree: Mapping[str, Any], keys: Iterable[str]) -> list[f
         try:
             numbers = np.array(data, dtype=np.float64).ravel()
         except (TypeError, ValueError):
-            raise DatasetError(f"{path}: {key} holds something that is no number") from None
+            raise DatasetError(f"{path}: {key} contains a value that is not a number") from None
         if not np.isfinite(numbers).all() or not len(numbers):
             raise DatasetError(f"{path}: {key} has numbers that are not finite")
         out: list[float] = numbers.tolist()
@@ -316,5 +316,5 @@ def _size(path: Path, tree: Mapping[str, Any], keys: Iterable[str], default: obj
     if value is None:
         return None
     if not isinstance(value, int) or value < 1:
-        raise DatasetError(f"{path}: the image's size is {value!r}")
+        raise DatasetError(f"{path}: invalid image size {value!r}")
     return value

@@ -25,34 +25,34 @@ from birdslam.vehicles.camera_height import (
     own_variance,
 )
 
-VEHICLES, LANES = "vehicles", "lanes"  # the cues of their sizes
+VEHICLES, LANES = "vehicles", "lanes"  # cues by size
 Floats = NDArray[np.float64]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
-Step = tuple[int, int, float]  # from frame, to frame, length as the odometry measured it
+Step = tuple[int, int, float]  # from frame, to frame, length measured by the odometry
 KnownLength = Callable[[int, int, int, int], float | None]  # (frames from, to; times from, to in ns) -> metres
 
 
 class HeightCheckConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Uncertainty of known lengths."""
 
-    section_m: Positive = 8.0  # over which an estimated length is compared with a known one
+    section_m: Positive = 8.0  # length over which an estimated length is compared with a known one
     sigma_scale_rel: Positive = 0.015  # of the mean ratio of lengths
 
 
 class VehicleHeightConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Uncertainty of the camera height from boxes of vehicles."""
 
-    sigma_class_rel: Positive = 0.04  # of the mean height of a class on a country's roads, and of a detector's boxes
-    sigma_bounce_rad: Positive = 0.008  # of the camera's pitch in one frame against its mean
-    sigma_pitch_rad: Positive = 0.003  # of the mean: edges of boxes lie alike above the wheels' contact
-    # Of the mean roll: vehicles on one side share the crown, curb or bank of the road
+    sigma_class_rel: Positive = 0.04  # of the mean height of a class, by country and detector
+    sigma_bounce_rad: Positive = 0.008  # of the camera's pitch in a frame around its mean
+    sigma_pitch_rad: Positive = 0.003  # of the mean: lower box edges have a common offset from the wheels' contact
+    # Of the mean roll: vehicles on one side share the crown, kerb or bank of the road
     sigma_crown_rad: Positive = 0.05
-    gate_sigma: Positive = 3.0  # of a vehicle's residual; beyond it is left out
+    gate_sigma: Positive = 3.0  # max. residual of a vehicle
     min_vehicles: Annotated[int, msgspec.Meta(ge=2)] = 5
 
 
 class HeightCheck(msgspec.Struct, frozen=True, kw_only=True):
-    """Camera height from something of known size or speed."""
+    """Camera height from objects of known size or speed."""
 
     cue: str
     height_m: float
@@ -62,7 +62,7 @@ class HeightCheck(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class Mounting:
-    """The camera's mounting: (height_m, pitch_rad, roll_rad) with cov (3, 3), and the number of vehicles it is by."""
+    """Camera mounting: (height_m, pitch_rad, roll_rad) with cov (3, 3), and the number of vehicles used."""
 
     state: Floats
     cov: Floats
@@ -76,7 +76,7 @@ def checks_by_length(
     camera: Camera,
     config: HeightCheckConfig,
 ) -> list[HeightCheck]:
-    """Checks by each of `lengths` that covers enough of the drive."""
+    """Checks from each of `lengths` that covers enough of the drive."""
     checks = (_by_length(cue, known, steps, times_ns, camera, config) for cue, known in lengths.items())
     return [check for check in checks if check is not None]
 
@@ -84,7 +84,7 @@ def checks_by_length(
 def checks_by_vehicles(
     boxes: Sequence[BoxHeight], camera: Camera, cov: Floats, config: VehicleHeightConfig
 ) -> list[HeightCheck]:
-    """One check, or none with too few vehicles; `cov` (2, 2) is that of pitch and roll."""
+    """One check, or none with too few vehicles; `cov` (2, 2) of pitch and roll."""
     prior = np.array([camera.height_m, camera.pitch_rad, camera.roll_rad])
     prior_cov = np.zeros((3, 3))
     prior_cov[0, 0] = (0.5 * camera.height_m) ** 2
@@ -101,7 +101,7 @@ def solve_mounting(
 ) -> Mounting | None:
     """Generalised least squares over all boxes with a prior of (height, pitch, roll); None with too few inliers.
 
-    The height's prior should be vague where the result is to be a check of it.
+    For a check of the height its prior should be vague.
     """
     if not boxes:
         return None
@@ -126,7 +126,7 @@ def solve_mounting(
         inlier = np.abs(normalised) < config.gate_sigma
         if inlier.sum() < config.min_vehicles:
             return None
-    # Where vehicles scatter more than their sigmas say, as on a hill, all are less sure (Birge's ratio)
+    # A scatter above the sigmas, as on a hill, widens the covariance (Birge's ratio)
     state, cov = state[:3], cov[:3, :3]
     scatter = float(np.square(normalised[inlier]).sum()) / max(int(inlier.sum()) - len(state), 1)
     cov *= max(1.0, scatter)
@@ -135,9 +135,9 @@ def solve_mounting(
 
 
 def _of_vehicle(rows: Floats, state: Floats, config: VehicleHeightConfig) -> tuple[Floats, Floats, Floats, float]:
-    """Normal equations of one vehicle's boxes, (6, 6) and (6,), its own variances (2,), and its residual in sigmas."""
+    """Normal equations of a vehicle's boxes, (6, 6) and (6,), its own variances (2,), and its residual in sigmas."""
     bottom, sigma_bottom, tall, sigma_tall, bearing, height_m, sigma_rel = rows[:, 1:].T
-    inverse_depth = tall / height_m  # 1 / z of a vehicle as tall as its class
+    inverse_depth = tall / height_m  # 1 / z of a vehicle with its class's height
     J = jacobian(inverse_depth, bearing)
     variance = sigma_bottom**2 + (state[0] / height_m * sigma_tall) ** 2 + config.sigma_bounce_rad**2
     aside_m = np.median(bearing / inverse_depth)
@@ -145,7 +145,7 @@ def _of_vehicle(rows: Floats, state: Floats, config: VehicleHeightConfig) -> tup
     residual = float(np.median(bottom - J[:, :STATES] @ state))
     common = np.square(np.median(J[:, [0, -1]], axis=0)) @ own
     sigma = math.sqrt(float(np.median(variance)) + float(common))
-    weighted = J / (variance[:, None] * len(rows))  # a vehicle's boxes err alike, and count as one
+    weighted = J / (variance[:, None] * len(rows))  # the boxes of a vehicle have common errors and count as one
     return J.T @ weighted, weighted.T @ bottom, own, residual / sigma
 
 
@@ -157,7 +157,7 @@ def _by_length(
     camera: Camera,
     config: HeightCheckConfig,
 ) -> HeightCheck | None:
-    """All lengths of the odometry are in proportion to the camera's height: so is the error of both."""
+    """All lengths of the odometry are proportional to the camera's height, and so are their errors."""
     ratios, weights = [], []
     estimated_m = true_m = 0.0
     for start, end, length in steps:

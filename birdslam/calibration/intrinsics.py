@@ -1,6 +1,6 @@
-"""Intrinsics of a camera without its place in the car, and their calibration by images of a chessboard.
+"""Camera intrinsics without the mounting, and their calibration from images of a chessboard.
 
-Everything here raises DatasetError with the file and the reason. `camera.Camera` checks the numbers themselves.
+All errors are DatasetError with the file and the reason. `camera.Camera` checks the values.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from birdslam.sources.recording import DatasetError
 
 Floats = NDArray[np.float64]
 
-FEWEST_BOARDS = 6
-MAX_REPROJECTION_PX = 1.0  # root mean square: past it something else than the lens was measured
+MIN_BOARDS = 6
+MAX_REPROJECTION_PX = 1.0  # max. RMS error: above it the lens model does not fit
 MAX_SIGMA_FOCAL_REL = 0.02
-MIN_TILT_DEG = 10.0  # between two of the boards: those that all stand alike leave the focal length open
+MIN_TILT_DEG = 10.0  # min. angle between two boards: equal tilts do not determine the focal length
 
 
 class Intrinsics(msgspec.Struct, frozen=True, kw_only=True):
-    """A camera without its place in the car; `width_px` is None where the file does not say."""
+    """A camera without its mounting; `width_px` is None if the file does not state it."""
 
     fx_px: float
     fy_px: float
@@ -38,14 +38,14 @@ class Intrinsics(msgspec.Struct, frozen=True, kw_only=True):
     width_px: int | None = None
     height_px: int | None = None
     source: str = ""
-    reprojection_px: float | None = None  # root mean square of a chessboard's corners
+    reprojection_px: float | None = None  # RMS of a chessboard's corners
     sigma_focal_px: float | None = None
-    left_out: tuple[str, ...] = ()  # images that could not be used, and why
+    left_out: tuple[str, ...] = ()  # unused images with the reason
 
     def for_size(self, width_px: int, height_px: int) -> Intrinsics:
-        """Of the same camera's images at another size of the same aspect; unchanged where the aspect is another.
+        """Scales to another image size of the same aspect ratio; unchanged for another one.
 
-        A pixel's middle has whole coordinates, so that the image's edge lies at -0.5.
+        Pixel centres have whole coordinates, so the image's edge is at -0.5.
         """
         if self.width_px is None or self.height_px is None:
             return self
@@ -65,14 +65,14 @@ class Intrinsics(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def from_chessboard(folder: Path, columns: int, rows: int, square_m: float) -> Intrinsics:
-    """By `cv2.calibrateCamera` from all images of a folder that show the board of `columns` x `rows` inner corners."""
+    """`cv2.calibrateCamera` from all images of a folder with a board of `columns` x `rows` inner corners."""
     if columns < 3 or rows < 3 or not 0.0 < square_m < 10.0:
-        raise DatasetError(f"chessboard of {columns}x{rows} inner corners, {square_m} m a square: is none")
+        raise DatasetError(f"chessboard of {columns}x{rows} inner corners, {square_m} m per square: invalid")
     if not folder.is_dir():
-        raise DatasetError(f"{folder}: {'is no directory' if folder.exists() else 'no such directory'}")
+        raise DatasetError(f"{folder}: {'not a directory' if folder.exists() else 'no such directory'}")
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in (".png", ".jpg", ".jpeg"))
     if not paths:
-        raise DatasetError(f"{folder}: no images in it (.png or .jpg)")
+        raise DatasetError(f"{folder}: no images (.png or .jpg)")
     corners, size, left_out = _find_corners(folder, paths, columns, rows)
     board = np.zeros((columns * rows, 3), np.float32)
     board[:, :2] = np.mgrid[0:columns, 0:rows].T.reshape(-1, 2) * square_m
@@ -82,9 +82,9 @@ def from_chessboard(folder: Path, columns: int, rows: int, square_m: float) -> I
     sigma_focal_px = float(np.max(sigma[:2]))
     if not np.isfinite(rms) or rms > MAX_REPROJECTION_PX:
         raise DatasetError(
-            f"{folder}: the corners miss the calibrated camera by {rms:.2f} px (root mean square), more than "
-            f"{MAX_REPROJECTION_PX} px: blurred images, a bent board, or not {columns}x{rows} inner "
-            f"corners{_without(left_out)}"
+            f"{folder}: the corners have an RMS error of {rms:.2f} px, more than "
+            f"{MAX_REPROJECTION_PX} px: blurred images, a bent board, or a board without {columns}x{rows} inner "
+            f"corners{_format_left_out(left_out)}"
         )
     _check_tilts(folder, turns, float(K[0, 0]), sigma_focal_px, left_out)
     return Intrinsics(
@@ -105,14 +105,14 @@ def from_chessboard(folder: Path, columns: int, rows: int, square_m: float) -> I
 def _find_corners(
     folder: Path, paths: list[Path], columns: int, rows: int
 ) -> tuple[list[NDArray[np.float32]], tuple[int, int], list[str]]:
-    """Inner corners (columns * rows, 1, 2) in px of each image that shows the board, and the size in px of most images.
+    """Inner corners (columns * rows, 1, 2) in px of each image with the board, and the most common image size in px.
 
-    Images of another size, torn ones and those without the board are left out: their names, with the reason.
+    Images of another size, unreadable ones and those without the board are left out; returns names and reasons.
     """
     images, left_out = _grey_images(paths)
     sizes = Counter(image.shape for image in images.values())
     if not sizes:
-        raise DatasetError(f"{folder}: none of its images can be read ({'; '.join(left_out)})")
+        raise DatasetError(f"{folder}: no readable image ({'; '.join(left_out)})")
     height_px, width_px = sizes.most_common(1)[0][0]
     corners: list[NDArray[np.float32]] = []
     for name, grey in images.items():
@@ -123,17 +123,17 @@ def _find_corners(
         if found:
             corners.append(np.asarray(at, np.float32).reshape(-1, 1, 2))
         else:
-            left_out.append(f"{name}: shows no board of {columns}x{rows} inner corners")
-    if len(corners) < FEWEST_BOARDS:
+            left_out.append(f"{name}: has no board of {columns}x{rows} inner corners")
+    if len(corners) < MIN_BOARDS:
         raise DatasetError(
             f"{folder}: the board of {columns}x{rows} inner corners was found in {len(corners)} of {len(paths)} "
-            f"images, {FEWEST_BOARDS} are needed{_without(left_out)}"
+            f"images, {MIN_BOARDS} needed{_format_left_out(left_out)}"
         )
     return corners, (width_px, height_px), left_out
 
 
 def _grey_images(paths: list[Path]) -> tuple[dict[str, NDArray[np.uint8]], list[str]]:
-    """By name; and what can't be read, with the reason."""
+    """Images by name, and the unreadable ones with the reason."""
     images: dict[str, NDArray[np.uint8]] = {}
     unread = []
     for path in paths:
@@ -146,18 +146,19 @@ def _grey_images(paths: list[Path]) -> tuple[dict[str, NDArray[np.uint8]], list[
     return images, unread
 
 
-def _without(left_out: Sequence[str]) -> str:
+def _format_left_out(left_out: Sequence[str]) -> str:
     return f"; left out: {'; '.join(left_out)}" if left_out else ""
 
 
 def _check_tilts(
     folder: Path, turns: Sequence[Any], focal_px: float, sigma_focal_px: float, left_out: Sequence[str]
 ) -> None:
-    """Raises DatasetError where boards, by their rotation vectors, stand too much alike to give the focal length."""
+    """Raises DatasetError if the boards' rotation vectors are too similar to determine the focal length."""
     normals = np.array([cv2.Rodrigues(np.asarray(turn))[0][:, 2] for turn in turns])
     tilt_deg = float(np.degrees(np.arccos(np.clip((normals @ normals.T).min(), -1.0, 1.0))))
     if tilt_deg < MIN_TILT_DEG or sigma_focal_px > MAX_SIGMA_FOCAL_REL * focal_px:
         raise DatasetError(
-            f"{folder}: the boards differ by {tilt_deg:.0f} degrees of tilt, and the focal length {focal_px:.0f} px is "
-            f"known to {sigma_focal_px:.1f} px: tilt the board more ({MIN_TILT_DEG:g} degrees){_without(left_out)}"
+            f"{folder}: the boards differ by {tilt_deg:.0f} degrees of tilt; the focal length {focal_px:.0f} px has a "
+            f"1-sigma of {sigma_focal_px:.1f} px; tilt the board more "
+            f"({MIN_TILT_DEG:g} degrees){_format_left_out(left_out)}"
         )

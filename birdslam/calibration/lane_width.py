@@ -15,15 +15,15 @@ from birdslam.calibration.height_check import LANES, HeightCheck
 from birdslam.lanes.topology import AT_M, WIDTH_M, WIDTH_SIGMA_M
 from birdslam.types import Bound, Lanes
 
-MIN_WAY_M = 20.0  # minimum distance under painted lanes: less may be a turning lane
-_ALIKE_M = 30.0  # correlation length of the width of lanes
+MIN_DISTANCE_M = 20.0  # min. distance under painted lanes: a shorter one may be a turning lane
+_CORRELATION_M = 30.0  # correlation length of lane widths
 
 
 class LaneWidth(NamedTuple):
-    """Width of the ego's lane in one frame (m, at the assumed height), and the distance travelled (m)."""
+    """Width of the ego's lane in one frame (m, at the assumed height) and the distance travelled (m)."""
 
     width_m: float
-    way_m: float
+    distance_m: float
 
 
 def painted_width_m(lanes: Lanes | None) -> float | None:
@@ -38,15 +38,15 @@ def painted_width_m(lanes: Lanes | None) -> float | None:
 
 def checks_by_lanes(seen: Sequence[LaneWidth], camera_height_m: float, sigma_pitch_rad: float) -> list[HeightCheck]:
     """One check, or none with too few painted lanes. The widths were measured at `camera_height_m`."""
-    widths_m, ways_m = (np.array(part) for part in zip(*seen, strict=True)) if seen else (np.zeros(0), np.zeros(0))
-    way_m = float(ways_m.sum())
-    if way_m < MIN_WAY_M:
+    widths_m, distances_m = (np.array(part) for part in zip(*seen, strict=True)) if seen else (np.zeros(0), np.zeros(0))
+    distance_m = float(distances_m.sum())
+    if distance_m < MIN_DISTANCE_M:
         return []
     order = np.argsort(widths_m)
-    cumulated = np.cumsum(ways_m[order])
-    low, middle, high = widths_m[order][np.searchsorted(cumulated, np.array([0.16, 0.5, 0.84]) * way_m)]
+    cumulated = np.cumsum(distances_m[order])
+    low, middle, high = widths_m[order][np.searchsorted(cumulated, np.array([0.16, 0.5, 0.84]) * distance_m)]
     height_m = camera_height_m * WIDTH_M / float(middle)
-    scatter_rel = 0.5 * float(high - low) / float(middle) / math.sqrt(max(1.0, way_m / _ALIKE_M))
-    pitch_rel = sigma_pitch_rad * AT_M / camera_height_m  # the road at AT_M is seen H / AT_M below the horizon
+    scatter_rel = 0.5 * float(high - low) / float(middle) / math.sqrt(max(1.0, distance_m / _CORRELATION_M))
+    pitch_rel = sigma_pitch_rad * AT_M / camera_height_m  # AT_M ahead the road is H / AT_M below the horizon
     sigma_rel = math.hypot(WIDTH_SIGMA_M / WIDTH_M, scatter_rel, pitch_rel)
     return [HeightCheck(cue=LANES, height_m=height_m, sigma_m=height_m * sigma_rel, samples=len(seen))]

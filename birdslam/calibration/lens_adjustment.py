@@ -17,53 +17,53 @@ from birdslam.geometry.pose import rotation_exp, rotation_log
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-IMAGES = 6  # of a window
-SIGMA_K1 = 0.3  # beforehand: dashboard cameras have -0.4 to 0
-HELD = 1e-6  # 1-sigma of what is held
-SHARED = 3  # numbers that all windows share
+IMAGES = 6  # per window
+SIGMA_K1 = 0.3  # prior: dashboard cameras have -0.4 to 0
+FIXED_SIGMA = 1e-6  # 1-sigma of a fixed parameter
+SHARED = 3  # number of parameters common to all windows
 _HUBER = 1.5  # sigmas
 _ITERATIONS = 30
 _CONVERGED = 1e-6  # relative change of the cost
-_MIN_LEFT = 8  # corners of a window, whose poses have 30 numbers
-_MIN_S = 1e-3  # between two images
-_MIN_DISTANCE, _BEHIND_COST = 1e-3, 1e3  # a corner is no nearer; what one behind the camera costs
+_MIN_CORNERS = 8  # min. corners of a window, whose poses have 30 parameters
+_MIN_INTERVAL_S = 1e-3  # min. interval between two images
+_MIN_DISTANCE, _BEHIND_COST = 1e-3, 1e3  # min. depth of a corner; cost of a corner behind the camera
 
 
 @dataclass(frozen=True)
 class LensProblem:
-    """What is adjusted: P corners, each of a window w; observed at px (P, IMAGES, 2), from the image's middle."""
+    """P corners, each of a window w, observed at px (P, IMAGES, 2) from the image centre, with initial values."""
 
     px: Floats
-    row: Floats  # (P, IMAGES) of the image they were read in: -0.5 the first, 0.5 the last
+    row: Floats  # (P, IMAGES) row of the observation: -0.5 first, 0.5 last
     of: Ints  # (P,) window of each corner
-    t_s: Floats  # (W, IMAGES) when the middle row of each image was read
+    t_s: Floats  # (W, IMAGES) readout time of the middle row of each image
     R: Floats  # (W, IMAGES, 3, 3) from the window's first camera to each
     t: Floats  # (W, IMAGES, 3)
     corner: Floats  # (P, 3) x / z, y / z, 1 / z in the window's first camera
     log_focal: float
     k1: float
-    sigma_px: float  # of a corner: a larger image has it in more pixels, whatever its lens turns out to be
-    fisheye: bool = False  # the radius grows with the angle from the axis, and not with its tangent
-    k1_before: tuple[float, float] = (0.0, SIGMA_K1)  # what is known of k1 beside the corners, with its 1-sigma
+    sigma_px: float  # of a corner; proportional to the image resolution
+    fisheye: bool = False  # equidistant: the radius is proportional to the angle from the axis
+    k1_prior: tuple[float, float] = (0.0, SIGMA_K1)  # prior of k1 with its 1-sigma
     readout_s: float = 0.0  # from the first row to the last
-    readout_before: tuple[float, float] = (0.0, HELD)  # what is known of it, with its 1-sigma
+    readout_prior: tuple[float, float] = (0.0, FIXED_SIGMA)  # prior of it with its 1-sigma
 
     @property
     def shared(self) -> Floats:
-        """(3,) what all windows share: k1, the log of the focal length, and the readout in s."""
+        """(3,) parameters common to all windows: k1, log of the focal length, readout in s."""
         return np.array([self.k1, self.log_focal, self.readout_s])
 
 
 @dataclass(frozen=True)
 class FocalPrior:
-    """What is known of the log of the focal length beside the images, with its 1-sigma."""
+    """Prior of the log of the focal length with its 1-sigma."""
 
     log_focal: float
     sigma: float
 
 
-def at_focal_length(problem: LensProblem, log_focal: float) -> LensProblem:
-    """The same images by another focal length: lateral lengths and turns are the smaller, depths stay."""
+def set_focal_length(problem: LensProblem, log_focal: float) -> LensProblem:
+    """Changes the focal length: lateral lengths and rotations scale inversely, depths stay."""
     by = math.exp(problem.log_focal - log_focal)
     R = problem.R.copy()
     for window in R:
@@ -75,15 +75,15 @@ def at_focal_length(problem: LensProblem, log_focal: float) -> LensProblem:
         t=problem.t * [by, by, 1.0],
         corner=problem.corner * [by, by, 1.0],
         k1=problem.k1 / by**2,
-        k1_before=(problem.k1_before[0] / by**2, problem.k1_before[1]),
+        k1_prior=(problem.k1_prior[0] / by**2, problem.k1_prior[1]),
         log_focal=log_focal,
     )
 
 
-def some_corners(problem: LensProblem, some: NDArray[np.bool_]) -> LensProblem:
-    """The problem of some of the corners (P,) alone; windows of which few are left are left out."""
+def select_corners(problem: LensProblem, some: NDArray[np.bool_]) -> LensProblem:
+    """The problem with a subset (P,) of the corners; drops windows with too few."""
     left = np.bincount(problem.of[some], minlength=len(problem.R))
-    some = some & (left >= _MIN_LEFT)[problem.of]
+    some = some & (left >= _MIN_CORNERS)[problem.of]
     windows = np.unique(problem.of[some])
     return replace(
         problem,
@@ -98,14 +98,14 @@ def some_corners(problem: LensProblem, some: NDArray[np.bool_]) -> LensProblem:
 
 
 def adjust(problem: LensProblem, prior: FocalPrior | None = None, converged: float = _CONVERGED) -> LensProblem:
-    """Levenberg-Marquardt on robust reprojection errors; without a prior the focal length is held.
+    """Levenberg-Marquardt on robust reprojection errors; without a prior the focal length is fixed.
 
-    It ends with a step that lowers the cost by less than a fraction of `converged`.
+    Stops when a step lowers the cost by less than the fraction `converged`.
     """
     damping = 1e-4
     cost, system = _linearise(problem, prior)
     for _ in range(_ITERATIONS):
-        tried = _moved(problem, *_solve(system, damping))
+        tried = _apply_step(problem, *_solve(system, damping))
         new_cost, new_system = _linearise(tried, prior)
         if not new_cost < cost:
             damping *= 10.0
@@ -119,21 +119,21 @@ def adjust(problem: LensProblem, prior: FocalPrior | None = None, converged: flo
     return problem
 
 
-def cost_of(problem: LensProblem, prior: FocalPrior) -> float:
-    """What is least after `adjust`."""
+def robust_cost(problem: LensProblem, prior: FocalPrior) -> float:
+    """The cost that `adjust` minimizes."""
     return _linearise(problem, prior)[0]
 
 
-def shared_by(problem: LensProblem, prior: FocalPrior | None) -> tuple[Floats, Floats]:
-    """`LensProblem.shared` by one step of Gauss and Newton from here, and its information (3, 3)."""
+def step_shared(problem: LensProblem, prior: FocalPrior | None) -> tuple[Floats, Floats]:
+    """`LensProblem.shared` after one Gauss-Newton step, and its information (3, 3)."""
     system = _linearise(problem, prior)[1]
-    information, gradient, *_ = _reduced(system, 0.0)
+    information, gradient, *_ = _reduce(system, 0.0)
     return problem.shared - np.linalg.solve(information, gradient), information
 
 
 @dataclass(frozen=True)
 class _System:
-    """Normal equations of the corners, and of each window's poses with the lens last, V = 6 (IMAGES - 1) + SHARED."""
+    """Normal equations of the corners and of each window's poses with the lens last, V = 6 (IMAGES - 1) + SHARED."""
 
     of: Ints  # (P,) window of each corner
     corner: Floats  # (P, 3, 3)
@@ -141,41 +141,44 @@ class _System:
     view: Floats  # (W, V, V)
     corner_gradient: Floats  # (P, 3)
     view_gradient: Floats  # (W, V)
-    prior: Floats  # (3, 3) information of what is known of the lens beforehand
+    prior: Floats  # (3, 3) information of the lens prior
     prior_gradient: Floats  # (3,)
 
 
 def _project(problem: LensProblem) -> tuple[Floats, Floats, Floats, Floats]:
-    """Rays turned into each image (P, I, 3), places q (P, I, 3) when each corner's row was read, normalised coordinates
-    u (P, I, 2), and how q goes with the readout (P, I, 3)."""
+    """Projects the corners.
+
+    Returns the rays rotated into each image (P, I, 3), positions q (P, I, 3) at the readout of each row, normalised
+    coordinates u (P, I, 2), and the derivative of q by the readout (P, I, 3).
+    """
     rays = np.concatenate([problem.corner[:, :2], np.ones((len(problem.corner), 1))], axis=1)
     turned = np.einsum("pikl,pl->pik", problem.R[problem.of], rays)
     q = turned + problem.corner[:, 2, None, None] * problem.t[problem.of]
-    turn, shift = (rate[problem.of] for rate in _rates(problem))
+    turn, shift = (rate[problem.of] for rate in _motion_rates(problem))
     by_readout = problem.row[..., None] * (np.cross(turn, q) + problem.corner[:, 2, None, None] * shift)
     q = q + problem.readout_s * by_readout
     u = q[..., :2] / np.maximum(q[..., 2:], _MIN_DISTANCE)
     return turned, q, u, by_readout
 
 
-def _rates(problem: LensProblem) -> tuple[Floats, Floats]:
-    """How the world turns, in rad/s, and shifts, a second, in the axes of each image: (W, IMAGES, 3) each.
+def _motion_rates(problem: LensProblem) -> tuple[Floats, Floats]:
+    """Angular rate (rad/s) and velocity (1/s) of the world in the axes of each image: (W, IMAGES, 3) each.
 
-    By the images before and after it; a turn between two images is small enough to be its sine.
+    By central differences; rotations between images are small enough for their sine.
     """
     R, t = problem.R, problem.t
     step = R[:, 1:] @ R[:, :-1].transpose(0, 1, 3, 2)
-    dt_s = np.maximum(np.diff(problem.t_s), _MIN_S)[..., None]
+    dt_s = np.maximum(np.diff(problem.t_s), _MIN_INTERVAL_S)[..., None]
     turn = 0.5 * np.stack([step[..., b, a] - step[..., a, b] for a, b in ((1, 2), (2, 0), (0, 1))], axis=-1) / dt_s
     shift = (t[:, 1:] - np.einsum("wkij,wkj->wki", step, t[:, :-1])) / dt_s
     turn, shift = (np.concatenate([x[:, :1], 0.5 * (x[:, 1:] + x[:, :-1]), x[:, -1:]], axis=1) for x in (turn, shift))
     return turn, shift
 
 
-def _distorted(problem: LensProblem, u: Floats) -> tuple[Floats, Floats, Floats]:
-    """d (..., 2), what the lens makes of normalised coordinates u (..., 2), and how it goes with them and with k1.
+def _distort(problem: LensProblem, u: Floats) -> tuple[Floats, Floats, Floats]:
+    """Distorts normalised coordinates u (..., 2) to d (..., 2); also returns the derivatives by u and by k1.
 
-    d = u (1 + k1 r^2) with r = |u|; of a fisheye u / r theta (1 + k1 theta^2) with theta = atan r.
+    d = u (1 + k1 r^2) with r = |u|; for a fisheye u / r theta (1 + k1 theta^2) with theta = atan r.
     """
     r = np.maximum(np.sqrt(np.square(u).sum(axis=-1, keepdims=True)), 1e-9)
     angle, angle_r = (np.arctan(r), 1.0 / (1.0 + r**2)) if problem.fisheye else (r, np.ones_like(r))
@@ -187,7 +190,7 @@ def _distorted(problem: LensProblem, u: Floats) -> tuple[Floats, Floats, Floats]
 
 
 def _huber(problem: LensProblem, q: Floats, d: Floats) -> tuple[Floats, Floats, Floats]:
-    """Residuals in sigma (P, I, 2), their weights and costs (P, I)."""
+    """Residuals in sigmas (P, I, 2), their weights and costs (P, I)."""
     r = (math.exp(problem.log_focal) * d - problem.px) / problem.sigma_px
     norm = np.sqrt(np.square(r).sum(axis=-1))
     ahead = q[..., 2] > _MIN_DISTANCE
@@ -197,14 +200,14 @@ def _huber(problem: LensProblem, q: Floats, d: Floats) -> tuple[Floats, Floats, 
 
 
 def _linearise(problem: LensProblem, prior: FocalPrior | None) -> tuple[float, _System]:
-    """The cost and the normal equations at the present values."""
-    prior = prior or FocalPrior(problem.log_focal, HELD)
+    """The cost and the normal equations at the current values."""
+    prior = prior or FocalPrior(problem.log_focal, FIXED_SIGMA)
     turned, q, u, q_readout = _project(problem)
-    d, d_u, d_k1 = _distorted(problem, u)
+    d, d_u, d_k1 = _distort(problem, u)
     r, weight, each = _huber(problem, q, d)
     focal_px, sigma_px = math.exp(problem.log_focal), problem.sigma_px
-    k1, sigma_k1 = problem.k1_before
-    readout_s, sigma_s = problem.readout_before
+    k1, sigma_k1 = problem.k1_prior
+    readout_s, sigma_s = problem.readout_prior
     known = np.array([k1, prior.log_focal, readout_s]), np.array([sigma_k1, prior.sigma, sigma_s]) ** -2.0
     away = problem.shared - known[0]
     cost = float(each.sum()) + 0.5 * float(known[1] @ away**2)
@@ -231,13 +234,13 @@ def _linearise(problem: LensProblem, prior: FocalPrior | None) -> tuple[float, _
     J_view, J_corner, r = (x.reshape(P, 2 * IMAGES, -1) for x in (by_image, J_corner, r))
     w = np.repeat(weight, 2, axis=1)[..., None]
     weighed = J_view * w
-    view = _summed_by_window(problem.of, weighed, J_view)
-    gradient = _summed_by_window(problem.of, weighed, r)[..., 0]
-    # A window's scale is its own: the way to its last image is held where it is
+    view = _sum_by_window(problem.of, weighed, J_view)
+    gradient = _sum_by_window(problem.of, weighed, r)[..., 0]
+    # A window has its own scale: its last image's distance is fixed
     last = slice(poses - 3, poses)
     for k, way in enumerate(problem.t[:, -1]):
         view[k, last, last] += 1e4 * np.outer(way, way) / float(way @ way)
-    view += 1e-3 * np.eye(poses + SHARED)  # nothing, but where all corners of a window are outliers
+    view += 1e-3 * np.eye(poses + SHARED)  # only matters if all corners of a window are outliers
     corner = (J_corner * w).transpose(0, 2, 1) @ J_corner + 1e-6 * np.eye(3)
     return cost, _System(
         of=problem.of,
@@ -251,24 +254,24 @@ def _linearise(problem: LensProblem, prior: FocalPrior | None) -> tuple[float, _
     )
 
 
-def _summed_by_window(of: Ints, a: Floats, b: Floats) -> Floats:
-    """The sum of a_p' b_p over the corners p of each window: (W, V, N) of (P, M, V) and (P, M, N)."""
-    ends = np.flatnonzero(np.diff(of)) + 1  # corners of one window stand together
+def _sum_by_window(of: Ints, a: Floats, b: Floats) -> Floats:
+    """Sum of a_p' b_p over the corners p of each window: (W, V, N) from (P, M, V) and (P, M, N)."""
+    ends = np.flatnonzero(np.diff(of)) + 1  # corners are ordered by window
     parts = zip(np.split(a, ends), np.split(b, ends), strict=True)
     return np.stack([x.reshape(-1, x.shape[-1]).T @ y.reshape(-1, y.shape[-1]) for x, y in parts])
 
 
-def _reduced(system: _System, damping: float) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Corners are eliminated first (Schur), then each window's poses by themselves, since windows share the lens alone.
+def _reduce(system: _System, damping: float) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """Eliminates the corners (Schur complement), then the poses of each window.
 
-    Information (3, 3) and gradient (3,) of the lens; how poses follow it (W, V - 3, 3) and what they are without it
-    (W, V - 3); inverse of the corners' (P, 3, 3).
+    Returns information (3, 3) and gradient (3,) of the lens; dependence of the poses on it (W, V - 3, 3) and their
+    solution without it (W, V - 3); inverses of the corners' blocks (P, 3, 3).
     """
     inverse = np.asarray(np.linalg.inv(system.corner * (1.0 + damping * np.eye(3))), np.float64)
     part = inverse @ system.corner_by_view
     view = system.view * (1.0 + damping * np.eye(system.view.shape[-1]))
-    view = view - _summed_by_window(system.of, system.corner_by_view, part)
-    gradient = system.view_gradient - _summed_by_window(system.of, part, system.corner_gradient[..., None])[..., 0]
+    view = view - _sum_by_window(system.of, system.corner_by_view, part)
+    gradient = system.view_gradient - _sum_by_window(system.of, part, system.corner_gradient[..., None])[..., 0]
     poses, lens = slice(None, -SHARED), slice(-SHARED, None)
     solved = np.linalg.solve(view[:, poses, poses], np.concatenate([view[:, poses, lens], gradient[:, poses, None]], 2))
     by_lens, alone = solved[..., :SHARED], solved[..., SHARED]
@@ -281,7 +284,7 @@ def _reduced(system: _System, damping: float) -> tuple[Floats, Floats, Floats, F
 
 def _solve(system: _System, damping: float) -> tuple[Floats, Floats, Floats]:
     """Steps of the poses (W, IMAGES - 1, 6), of the lens (3,) and of the corners (P, 3)."""
-    information, gradient, by_lens, alone, inverse = _reduced(system, damping)
+    information, gradient, by_lens, alone, inverse = _reduce(system, damping)
     lens = np.asarray(-np.linalg.solve(information, gradient), np.float64)
     poses = np.asarray(-alone - by_lens @ lens, np.float64)
     windows = len(poses)
@@ -292,7 +295,7 @@ def _solve(system: _System, damping: float) -> tuple[Floats, Floats, Floats]:
     return poses.reshape(windows, IMAGES - 1, 6), lens, corner
 
 
-def _moved(problem: LensProblem, poses: Floats, lens: Floats, corner: Floats) -> LensProblem:
+def _apply_step(problem: LensProblem, poses: Floats, lens: Floats, corner: Floats) -> LensProblem:
     R, t = problem.R.copy(), problem.t.copy()
     t[:, 1:] += poses[..., 3:]
     for window, steps in zip(R, poses, strict=True):

@@ -1,4 +1,4 @@
-"""Windows of a drive for lens calibration: selection of images and corners, and initialization."""
+"""Windows of a drive for the lens calibration: selection of images and corners, and initial values."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.calibration.lens_adjustment import HELD, IMAGES, LensProblem
+from birdslam.calibration.lens_adjustment import FIXED_SIGMA, IMAGES, LensProblem
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import rotation_log
 from birdslam.odometry.corners.feature_tracks import FeatureConfig, FeatureTracker
@@ -20,38 +20,36 @@ from birdslam.odometry.working_resolution import WorkingResolution
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-# So far this share of the corners has moved from one image of a window to the next; of short drives less, and of lenses
-# that see so far across that near corners are soon gone
-_MOVED, _MOVED_WIDE = 0.4, 0.15
-_STEPS_RAD = (0.016, _MOVED), (0.012, _MOVED), (0.012, _MOVED_WIDE)
-_FIXED_RAD = 0.003  # a corner that moves by less over a window is far off, or on the windscreen or bonnet
+# Share of corners that moved by a step from one image of a window to the next; the second for short drives and for wide
+# lenses, which soon lose near corners
+_MIN_MOVED_RATIO, _MIN_MOVED_RATIO_WIDE = 0.4, 0.15
+_STEPS_RAD = (0.016, _MIN_MOVED_RATIO), (0.012, _MIN_MOVED_RATIO), (0.012, _MIN_MOVED_RATIO_WIDE)
+_MIN_MOTION_RAD = 0.003  # min. motion over a window; slower corners are far away or on the windscreen or bonnet
 _MAX_WINDOWS = 40
 _MIN_WINDOWS = 4
-_MIN_CORNERS = 20  # of a window
+_MIN_CORNERS = 20  # per window
 _MAX_CORNERS = 100
-_NEAR_CORNERS = 60  # of these, where the nearest are asked for
-_TWO_VIEW_PX = 1.5  # outliers' limit of the first poses, by pixels of a lens of FOCAL_PX
+_NEAR_CORNERS = 60  # of these, near ones in `select_near_windows`
+_MAX_RESIDUAL_PX = 1.5  # outlier limit of the initial poses, in pixels of a lens of FOCAL_PX
 FOCAL_PX = 720.0
 _MAX_TURN_RAD = 0.8  # of a window
-_MAX_DISTANCE = 80.0  # of a corner that begins the adjustment, in baselines of its window
-_WIDEST_RAD = 1.45  # from the axis, of a corner
+_MAX_DISTANCE = 80.0  # of a corner with initial values, in baselines of its window
+_MAX_ANGLE_RAD = 1.45  # max. angle of a corner from the axis
 
 
 @dataclass(frozen=True)
 class CornersOfImage:
-    """Followed corners of one raw image: ids (N,) ascending, px (N, 2); `t_s` is when its middle row was read."""
+    """Tracked corners of one raw image: ids (N,) ascending, px (N, 2); `t_s` is the readout time of its middle row."""
 
     ids: Ints
     px: Floats
     t_s: float = 0.0
 
 
-def followed_corners(images: Iterable[tuple[NDArray[np.uint8], Floats, float]], camera: Camera) -> list[CornersOfImage]:
-    """Corners of a camera's raw images, each with its boxes (B, 4) of vehicles and its time in s.
+def track_corners(images: Iterable[tuple[NDArray[np.uint8], Floats, float]], camera: Camera) -> list[CornersOfImage]:
+    """Tracks corners through raw images, given with the boxes (B, 4) of vehicles and the time in s.
 
-    They are followed from each image to the next, outside these boxes.
-
-    Of the camera only its size and about its focal length count.
+    Corners in boxes are left out. `camera` needs the image size and an approximate focal length only.
     """
     out: list[CornersOfImage] = []
     resolution = WorkingResolution(camera)
@@ -66,9 +64,9 @@ def followed_corners(images: Iterable[tuple[NDArray[np.uint8], Floats, float]], 
 
 @dataclass(frozen=True)
 class Window:
-    """Corners that all images of one window show, px (IMAGES, N, 2) from the middle; the images' times (IMAGES,).
+    """Corners visible in all images of a window: px (IMAGES, N, 2) from the image centre; image times (IMAGES,).
 
-    `row` (IMAGES, N): where in the raw image each was read, -0.5 in its first row to 0.5 in its last.
+    `row` (IMAGES, N): row of the observation, -0.5 first to 0.5 last.
     """
 
     px: Floats
@@ -76,25 +74,25 @@ class Window:
     t_s: Floats
 
 
-def windows_of(images: Sequence[CornersOfImage], middle: Floats, focal_px: float) -> list[Window]:
-    """Windows of a drive; `middle` (2,) is that of its images, the focal length about right."""
+def select_windows(images: Sequence[CornersOfImage], middle: Floats, focal_px: float) -> list[Window]:
+    """Windows of a drive; `middle` (2,) is the image centre; the focal length is approximate."""
     windows: list[Window] = []
     for step_rad, share in _STEPS_RAD:
         if len(windows) < 2 * _MIN_WINDOWS:
-            windows = _apart(images, middle, step_rad * focal_px, share)
+            windows = _select_apart(images, middle, step_rad * focal_px, share)
     return windows
 
 
-def near_windows(images: Sequence[CornersOfImage], middle: Floats, focal_px: float) -> list[Window]:
-    """As `windows_of`, of images so close to each other that the nearest corners are in all of a window's."""
+def select_near_windows(images: Sequence[CornersOfImage], middle: Floats, focal_px: float) -> list[Window]:
+    """Like `select_windows`, with images so close that they share the nearest corners."""
     step_rad, share = _STEPS_RAD[-1]
-    return _apart(images, middle, step_rad * focal_px, share, nearest=True)
+    return _select_apart(images, middle, step_rad * focal_px, share, nearest=True)
 
 
-def _apart(
+def _select_apart(
     images: Sequence[CornersOfImage], middle: Floats, step_px: float, share: float, nearest: bool = False
 ) -> list[Window]:
-    """Windows of the drive, each of images between which a share of the corners has moved by a step."""
+    """Windows of images between which a share of the corners moved by a step."""
     found, first = [], 0
     while first < len(images) - IMAGES:
         at = [first]
@@ -109,7 +107,7 @@ def _apart(
         if len(at) < IMAGES:
             first += 1
             continue
-        window = _common(images, at, middle, step_px / _STEPS_RAD[0][0] * _FIXED_RAD, nearest)
+        window = _common_corners(images, at, middle, step_px / _STEPS_RAD[0][0] * _MIN_MOTION_RAD, nearest)
         if window is not None:
             found.append(window)
         first = at[IMAGES // 2]
@@ -118,13 +116,13 @@ def _apart(
 
 
 def _flow_px(a: CornersOfImage, b: CornersOfImage) -> Floats:
-    """(N,) how far the corners that both show have moved."""
+    """(N,) displacement of the corners common to both images."""
     _, in_a, in_b = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
     out: Floats = np.linalg.norm(b.px[in_b] - a.px[in_a], axis=1)
     return out
 
 
-def _common(
+def _common_corners(
     images: Sequence[CornersOfImage], at: Sequence[int], middle: Floats, fixed_px: float, nearest: bool
 ) -> Window | None:
     ids = images[at[0]].ids
@@ -135,9 +133,9 @@ def _common(
     ids, moved = ids[moved > fixed_px], moved[moved > fixed_px]
     if len(ids) < _MIN_CORNERS:
         return None
-    if len(ids) > _MAX_CORNERS:  # evenly over their ids, which are those of all parts of the image
+    if len(ids) > _MAX_CORNERS:  # evenly over the ids, which cover all parts of the image
         some = np.linspace(0, len(ids) - 1, _MAX_CORNERS).astype(int)
-        if nearest:  # those that moved most, and of the others some that hold the turns
+        if nearest:  # the corners with the largest motion, and others that constrain the rotation
             order = np.argsort(-moved, kind="stable")
             least = np.linspace(_NEAR_CORNERS, len(ids) - 1, _MAX_CORNERS - _NEAR_CORNERS).astype(int)
             some = np.sort(np.concatenate([order[:_NEAR_CORNERS], order[least]]))
@@ -147,32 +145,32 @@ def _common(
     return Window(px, rows, np.array([images[k].t_s for k in at]))
 
 
-def _undistorted(px: Floats, focal_px: float, k1: float, fisheye: bool) -> Floats:
-    """(..., 2) normalised coordinates of pixels from the middle, by fixed-point iteration."""
+def _undistort(px: Floats, focal_px: float, k1: float, fisheye: bool) -> Floats:
+    """(..., 2) normalised coordinates of pixels from the centre, by fixed-point iteration."""
     distorted = px / focal_px
     radius = np.maximum(np.sqrt(np.square(distorted).sum(axis=-1, keepdims=True)), 1e-9)
     found = radius
     for _ in range(8):
         found = radius / np.maximum(1.0 + k1 * np.square(found), 0.3)
-    out: Floats = distorted / radius * (np.tan(np.minimum(found, _WIDEST_RAD)) if fisheye else found)
+    out: Floats = distorted / radius * (np.tan(np.minimum(found, _MAX_ANGLE_RAD)) if fisheye else found)
     return out
 
 
-def begin(
+def initialize(
     windows: Sequence[Window],
     focal_px: float,
     k1: float,
     sigma_px: float,
     fisheye: bool,
-    k1_before: tuple[float, float],
-    readout_before: tuple[float, float] = (0.0, HELD),
+    k1_prior: tuple[float, float],
+    readout_prior: tuple[float, float] = (0.0, FIXED_SIGMA),
 ) -> LensProblem | None:
-    """Poses and corners of each window, by its first and last image and by resection of those between."""
+    """Initial poses and corners of each window: from its first and last image, then resection of the others."""
     px, row, t_s, of, corner = [], [], [], [], []
     R: list[Floats] = []
     t: list[Floats] = []
     for window in windows:
-        started = _begin_window(_undistorted(window.px, focal_px, k1, fisheye))
+        started = _initialize_window(_undistort(window.px, focal_px, k1, fisheye))
         if started is None:
             continue
         keep, R_w, t_w, corner_w = started
@@ -197,23 +195,23 @@ def begin(
         k1,
         sigma_px,
         fisheye,
-        k1_before,
-        readout_before[0],
-        readout_before,
+        k1_prior,
+        readout_prior[0],
+        readout_prior,
     )
 
 
-def _begin_window(xy: Floats) -> tuple[NDArray[np.bool_], Floats, Floats, Floats] | None:
-    """Which corners of (IMAGES, N, 2) normalised coordinates begin, poses of the images, and corners (N', 3)."""
+def _initialize_window(xy: Floats) -> tuple[NDArray[np.bool_], Floats, Floats, Floats] | None:
+    """Initial values from (IMAGES, N, 2) normalised coordinates: usable corners, poses, and corners (N', 3)."""
     cv2.setRNGSeed(1)
     first, last = xy[0], xy[-1]
-    E, inliers = cv2.findEssentialMat(first, last, np.eye(3), cv2.USAC_MAGSAC, 0.999, _TWO_VIEW_PX / FOCAL_PX, 500)
+    E, inliers = cv2.findEssentialMat(first, last, np.eye(3), cv2.USAC_MAGSAC, 0.999, _MAX_RESIDUAL_PX / FOCAL_PX, 500)
     if E is None or E.shape != (3, 3) or inliers is None:
         return None
     _, R, t, _, _ = cv2.recoverPose(E, first, last, cameraMatrix=np.eye(3), distanceThresh=1e5, mask=inliers.copy())
     turn: Floats = np.asarray(R, np.float64)
     R, t = turn, np.asarray(t, np.float64).ravel()
-    if abs(t[2]) < 0.5 or np.linalg.norm(rotation_log(turn)) > _MAX_TURN_RAD:  # no car's
+    if abs(t[2]) < 0.5 or np.linalg.norm(rotation_log(turn)) > _MAX_TURN_RAD:  # implausible for a car
         return None
     P = np.hstack([R, t[:, None]])
     X = cv2.triangulatePoints(np.eye(3, 4), P, first.T, last.T)
@@ -226,7 +224,7 @@ def _begin_window(xy: Floats) -> tuple[NDArray[np.bool_], Floats, Floats, Floats
     poses_R, poses_t = [np.eye(3)], [np.zeros(3)]
     for seen in xy[1:-1]:
         found, turned, place, _ = cv2.solvePnPRansac(
-            X[keep], seen[keep], np.eye(3), np.zeros(4), reprojectionError=2.0 * _TWO_VIEW_PX / FOCAL_PX,
+            X[keep], seen[keep], np.eye(3), np.zeros(4), reprojectionError=2.0 * _MAX_RESIDUAL_PX / FOCAL_PX,
             iterationsCount=50,
         )  # fmt: skip
         if not found:

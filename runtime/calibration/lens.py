@@ -14,9 +14,9 @@ from birdslam.calibration.calibration import CalibrationError
 from birdslam.calibration.intrinsics import Intrinsics
 from birdslam.calibration.lens import WIDE_SIGMA_REL, k1_by_bend, self_calibrate
 from birdslam.calibration.lens_adjustment import IMAGES, SIGMA_K1
-from birdslam.calibration.lens_windows import CornersOfImage, followed_corners
+from birdslam.calibration.lens_windows import CornersOfImage, track_corners
 from birdslam.calibration.travel import TravelPitch
-from birdslam.calibration.uprights import UPRIGHT_IMAGES, LensByUprights, lens_by_uprights, upright_edges
+from birdslam.calibration.uprights import MAX_IMAGES, LensByVerticalEdges, find_vertical_edges, lens_by_vertical_edges
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.runtime.calibration.given import FocalLength, Given, focal_length_of
@@ -53,7 +53,7 @@ def lens_of_drive(
     camera = Camera(width_px, height_px, focal_px, focal_px, *middle, height_m=given.height_m or UNKNOWN_HEIGHT_M)
     edges: list[Floats] = []
     corners = corners_of_drive(configuration, uri, camera, stride, edges)
-    uprights = lens_by_uprights(edges)
+    uprights = lens_by_vertical_edges(edges)
     known = with_uprights(known, uprights, width_px)
     focal_px, sigma_rel, by = known.px, known.sigma_rel, known.by
     bend = None if uprights is None or known.fisheye else (uprights.bend, uprights.bend_sigma)
@@ -111,7 +111,7 @@ def corners_of_drive(
     raw = msgspec.structs.replace(camera, distortion=(), fisheye=False)
     recording = open_recorded(uri, raw, stride, configuration.source.topics)
     frames = max(1, round(_LENS_S * recording.rate_hz))
-    every = max(1, min(frames, len(recording) or frames) // UPRIGHT_IMAGES)
+    every = max(1, min(frames, len(recording) or frames) // MAX_IMAGES)
     with Inference(complete(configuration, raw, recording.rate_hz)) as inference:
 
         def images() -> Iterator[tuple[NDArray[np.uint8], Floats, float]]:
@@ -119,15 +119,15 @@ def corners_of_drive(
             for index, frame in enumerate(with_progress(seen, "lens", min(frames, len(recording)) or None)):
                 if frame.image is not None:
                     if edges is not None and index % every == 0:
-                        edges.append(upright_edges(frame.image))
+                        edges.append(find_vertical_edges(frame.image))
                     found = inference.start(frame).result().detections
                     boxes_px = np.zeros((0, 4)) if found is None else found.boxes_px
                     yield frame.image, boxes_px, frame.t_source_ns / NS_PER_S
 
-        return followed_corners(images(), raw)
+        return track_corners(images(), raw)
 
 
-def with_uprights(known: FocalLength, uprights: LensByUprights | None, width_px: int) -> FocalLength:
+def with_uprights(known: FocalLength, uprights: LensByVerticalEdges | None, width_px: int) -> FocalLength:
     """Returns the focal length from a fisheye's vertical edges, if the field of view is unknown."""
     if uprights is None or uprights.fisheye_focal is None or known.fisheye or known.sigma_rel < WIDE_SIGMA_REL:
         return known

@@ -10,7 +10,7 @@ import numpy as np
 
 from birdslam.calibration.calibration import Calibration
 from birdslam.calibration.intrinsics import Intrinsics
-from birdslam.calibration.readout import USUAL, Readout
+from birdslam.calibration.readout import PRIOR, Readout
 from birdslam.geometry.camera import Camera
 from birdslam.outputs.drive_files import ResultsError
 from birdslam.runtime.calibration.height import AGREES_SIGMA, HeightBy, check_sigma_rel
@@ -73,7 +73,7 @@ def _rows(readout: Readout, height_by: HeightBy, speed_mps: float) -> Iterator[s
     else:
         by_drive_ms, sigma_ms = (1e3 * each for each in readout.by_drive)
         yield f"  by the drive {by_drive_ms:.0f} +- {sigma_ms:.0f} ms (of {readout.windows} windows)"
-        yield f"  by most cameras {1e3 * USUAL.readout_s:.0f} +- {1e3 * USUAL.sigma_s:.0f} ms"
+        yield f"  by most cameras {1e3 * PRIOR.readout_s:.0f} +- {1e3 * PRIOR.sigma_s:.0f} ms"
 
 
 def write_camera_file(path: Path, camera: Camera, report: Sequence[str]) -> None:
