@@ -1,4 +1,4 @@
-"""A vehicle's 3-D box by a network: centre, size and heading, each with its uncertainty."""
+"""3-D boxes of vehicles by a network: centre, size and heading with their uncertainties."""
 
 from __future__ import annotations
 
@@ -14,13 +14,11 @@ from birdslam.geometry.camera import Camera, GroundPlane
 
 @dataclass(frozen=True)
 class Boxes3d:
-    """N bodies, one for each 2-D box and in its order; sigmas are standard deviations.
+    """N bodies, one per 2-D box in its order; sigmas are standard deviations.
 
-    `alpha_rad` is the observation angle: the yaw in ego less the centre's bearing, REP-103 (0 faces away from the
-    camera, pi/2 faces left). `flip` is the probability that front and rear are swapped.
-
-    With `canonical_focal_rel` > 0 depths are those of a canonical camera, whose focal length is this factor times its
-    image's width; `in_metres` converts them.
+    `alpha_rad` is the observation angle: yaw in ego minus the centre's bearing (REP-103; 0 faces away from the camera,
+    pi/2 faces left). `flip` is the probability that front and rear are swapped. With `canonical_focal_rel` > 0 depths
+    are those of a canonical camera with this focal length over image width; `in_metres` converts them.
     """
 
     centre_px: Floats  # (N, 2) the body's centre in the undistorted image, also beyond its edge
@@ -37,7 +35,7 @@ class Boxes3d:
         return len(self.depth_m)
 
     def take(self, rows: Ints | Sequence[int]) -> Boxes3d:
-        """The given rows, in that order."""
+        """Selects rows in the given order."""
         return Boxes3d(
             self.centre_px[rows],
             self.depth_m[rows],
@@ -51,7 +49,7 @@ class Boxes3d:
         )
 
     def in_metres(self, camera: Camera) -> Boxes3d:
-        """The bodies with this camera's depths; itself where its depths are not canonical."""
+        """The bodies with depths of this camera; itself if they are not canonical."""
         if self.canonical_focal_rel <= 0.0:
             return self
         factor = camera.fx_px / (self.canonical_focal_rel * camera.width_px)

@@ -13,7 +13,7 @@ SHIPPED = Path(__file__).parent / "shipped" / "lanes.onnx"
 
 
 def shipped_completion(shape: tuple[int, int]) -> GridCompletion | None:
-    """The package's own, for grids of `shape`; None where it was built without. Raises ModelError."""
+    """The package's own network for grids of `shape`; None if it is not installed. Raises ModelError."""
     return GridCompletion(shape) if SHIPPED.is_file() else None
 
 
@@ -40,7 +40,7 @@ class GridCompletion:
         self(np.zeros((2, *shape), dtype=np.float32))  # warm-up
 
     def __call__(self, grids: Floats32) -> Floats32:
-        """Grids (2, rows, columns) completed."""
+        """Completes grids (2, rows, columns)."""
         (out,) = self._session.run(None, {self._input: grids[None]})
         completed: Floats32 = out[0]
         return completed

@@ -1,4 +1,4 @@
-"""Detections of somebody else's detector or tracker, in place of a network's."""
+"""Detections of an external detector or tracker, in place of a network's."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def external_detections(
 
 
 def undistort_boxes(camera: Camera, boxes_px: Floats) -> Floats:
-    """Boxes (N, 4) of the camera's own images as they are in undistorted ones: by the middles of their sides."""
+    """Moves boxes (N, 4) from the camera's raw images to undistorted ones, by the middles of their sides."""
     if not (camera.distortion and len(boxes_px)):
         return boxes_px
     x1, y1, x2, y2 = boxes_px.T

@@ -1,7 +1,6 @@
-"""How sure the edges of boxes are, by the family of their detector.
+"""1-sigma of box edges by detector family, measured by `python -m perf box_edges` on KITTI tracking (docs/networks.md).
 
-Measured by `python -m perf box_edges` on KITTI tracking, as docs/networks.md says; where a family draws an edge beside
-the vehicle's on average, that is in its sigma: boxes come in as they are.
+A mean offset of an edge is part of its sigma, since boxes are not corrected.
 """
 
 from __future__ import annotations
@@ -18,14 +17,14 @@ FAMILIES: dict[str, EdgeSigma] = {
     # Single-shot networks of small input: vehicle-detection-adas-0002 on 0002 and 0005
     "ssd": EdgeSigma((0.0875, 0.0875, 0.0525, 0.085), 0.25),
 }
-UNKNOWN = FAMILIES["ssd"]  # of a family that was not measured: as the widest that was
+UNKNOWN = FAMILIES["ssd"]  # of an unmeasured family: the largest measured sigma
 
 # "configured": `slam.frontend.localisation.sigma_box_rel` and `sigma_box_px`
 Family = Literal["unknown", "rrc", "yolox", "ssd", "configured"]
 
 
 def sigma_of(family: Family) -> EdgeSigma | None:
-    """Of a family's boxes; None: the configuration's. Raises ValueError for another name."""
+    """1-sigma of a family's edges; None: the configuration's. Raises ValueError for an unknown name."""
     if family == "configured":
         return None
     if family != "unknown" and family not in FAMILIES:

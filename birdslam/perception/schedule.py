@@ -1,4 +1,4 @@
-"""The networks' schedule: which runs on which frame, and which results a frame gets once it can wait no longer."""
+"""Schedule of the networks: which one runs on which frame, and which results a frame gets."""
 
 from __future__ import annotations
 

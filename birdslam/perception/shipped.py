@@ -12,24 +12,23 @@ from birdslam.perception.schedule import Networks
 
 
 def shipped_networks() -> Networks:
-    """The package's own network, which finds vehicles, road, lane markings and depth. Raises ModelError.
+    """The package's own network for vehicles, road, lane markings and depth. Raises ModelError.
 
-    It was trained on rendered streets alone; on real roads `load_networks` with YOLOX and TwinLiteNet sees more.
+    It was trained on rendered streets only; on real roads YOLOX and TwinLiteNet (`load_networks`) detect more.
     """
     return load_networks({"multitask": ModelSpec(path=str(SHIPPED_NETWORKS / SHIPPED_MULTITASK))})
 
 
 def load_networks(specs: Mapping[Role, ModelSpec]) -> Networks:
-    """A network for each role, run in the caller's thread, one after the other, and awaited to its end.
+    """Loads a network for each role; they run one after the other in the caller's thread.
 
-    So what is found depends on the images alone. Each ONNX file has its manifest, FILE.toml, beside it
-    (docs/networks.md). Raises ModelError, which names the file and what is wrong with it.
+    Each ONNX file has a manifest, FILE.toml, next to it (docs/networks.md). Raises ModelError.
     """
     return Networks([load_network(role, spec) for role, spec in specs.items()], run_at_once)
 
 
 def run_at_once(run: Callable[..., Any], *arguments: Any) -> Future[Any]:
-    """An executor for `Networks` that runs what it is given before it returns; an exception is the future's."""
+    """An executor for `Networks` that runs its task immediately; an exception is stored in the future."""
     done: Future[Any] = Future()
     try:
         done.set_result(run(*arguments))

@@ -1,9 +1,8 @@
 """Removes the grass verge from road masks by excess green (Woebbecke et al. 1995).
 
-A network trained on other roads takes a verge for road where no kerb divides them. Grass is no plane and has far more
-texture than asphalt, so that the alignment of the road would see little else. Excess green separates them in any light
-that shows colours:  2 g - r - b,  with r, g, b = R, G, B over R + G + B.  It counts from the road's own level where
-that is green itself (white balance, light), else from grey.
+Networks trained on other roads label a verge without a kerb as road. Its texture would dominate the alignment of the
+road. Excess green, 2 g - r - b with r, g, b = R, G, B over R + G + B, is compared with the road's own level, or with
+grey if that is higher.
 """
 
 from __future__ import annotations
@@ -14,11 +13,10 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.arrays import Bools
 
-SHRINK = 4  # downscaling: single blades and the camera's noise do not count
-# Above the road's level, of a pixel that shows grass. On five images of KITTI tracking 0005 the lane's pixels lie
-# within 0.03 of their median, and 19 of 20 of the verge's 0.1 to 0.3 above it
+SHRINK = 4  # downscaling suppresses single blades and noise
+# Min. excess of grass over the road's level
 MIN_EXCESS = 0.06
-ROAD_SHARE = 0.3  # the road's level is this quantile of the mask, of which 70 % may be grass
+ROAD_SHARE = 0.3  # the road's level is this quantile of the mask, up to 70 % of which may be grass
 DARKEST = 60.0  # of R + G + B: darker pixels have no reliable colour
 MIN_PIXELS = 50  # of a downscaled mask, for the level
 
@@ -31,7 +29,7 @@ def without_verge(road: Bools, image: NDArray[np.uint8]) -> Bools:
     rows, columns = (road.shape[0] - top) // SHRINK, road.shape[1] // SHRINK
     if not (rows and columns):
         return road
-    part = slice(top, top + SHRINK * rows), slice(0, SHRINK * columns)  # an integer factor is by far the fastest
+    part = slice(top, top + SHRINK * rows), slice(0, SHRINK * columns)  # an integer factor is the fastest
     small = cv2.resize(image[part], (columns, rows), interpolation=cv2.INTER_AREA)
     blue, green, red = (plane.astype(np.float32) for plane in cv2.split(small))
     sums = blue + green + red
@@ -44,7 +42,7 @@ def without_verge(road: Bools, image: NDArray[np.uint8]) -> Bools:
     level = max(
         float(np.partition(excess_road, at)[at]), 0.0
     )  # red bricks and cars in a mask must not make a grey road count as green
-    # A single pixel is a leaf on the road, or a marking's fringe
+    # A single pixel is a leaf on the road or the fringe of a marking
     grass = cv2.medianBlur((coloured & (excess > level + MIN_EXCESS)).view(np.uint8), 3)
     out = road.copy()
     size = SHRINK * columns, SHRINK * rows

@@ -1,4 +1,4 @@
-"""From the image to the network's input and back: the part of the image that a run sees, and its place in the input."""
+"""Views of an image in the network's input: the visible part of the image and its position in the input."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from birdslam.perception.manifest import FitPad, Input, Tiles
 
 @dataclass(frozen=True)
 class View:
-    """A column of the image, x0_px to x1_px over its full height, and the rectangle of the input that it is resized to.
+    """A column of the image, x0_px to x1_px over its full height, and the rectangle of the input it is resized to.
 
-    Coordinates are those of edges, not of pixel centres: the image spans (0, 0) to (width, height).
+    Coordinates are of pixel edges, not centres: the image spans (0, 0) to (width, height).
     """
 
     image_width_px: int

@@ -1,1 +1,1 @@
-"""ONNX files: outputs that nobody reads and weights that slow a processor down are taken out."""
+"""Edits ONNX files for speed: removes unread outputs and subnormal weights."""

@@ -1,8 +1,7 @@
-"""Sets weights that are as good as zero to zero in an ONNX file's bytes, for speed.
+"""Sets negligible weights in an ONNX file's bytes to zero, for speed.
 
 Training with weight decay leaves dead channels at 1e-40. Their products are subnormal numbers, which many CPUs multiply
-a hundred times slower: TwinLiteNet ran 440 ms instead of 63 ms on an Intel server, with bit-identical outputs.
-onnxruntime's own switch (session.set_denormal_as_zero) does not reach the calling thread.
+far more slowly. onnxruntime's own switch (session.set_denormal_as_zero) does not reach the calling thread.
 """
 
 from __future__ import annotations

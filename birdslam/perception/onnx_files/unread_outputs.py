@@ -1,6 +1,6 @@
-"""Removes outputs that nobody reads from an ONNX file's bytes, with all that only they need, for speed.
+"""Removes unread outputs from an ONNX file's bytes, with all nodes that only they need, for speed.
 
-onnxruntime computes every node of a graph, whatever is asked for: the depth map is a seventh of the shipped network.
+onnxruntime computes every node of a graph, also for outputs that are not requested.
 """
 
 from __future__ import annotations
