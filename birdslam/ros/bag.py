@@ -1,4 +1,4 @@
-"""A bag that is read: ROS 2 (a directory, .mcap, .db3) and ROS 1 (.bag), whatever its storage."""
+"""Reads ROS bags of any storage: ROS 2 (a directory, .mcap, .db3) and ROS 1 (.bag)."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ NEEDS_EXTRA = "ROS bags need the library rosbags: pip install 'birdslam[ros]'"
 
 
 class BagError(ValueError):
-    """A bag that can't be used; the message names it and says why."""
+    """A bag that can't be used; the message names it and the reason."""
 
 
 class BagTopics(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Which topics of a ROS bag are read."""
+    """Names of the topics read from a ROS bag."""
 
     image: str = ""  # sensor_msgs/Image or CompressedImage; "": the only one that is there
     camera_info: str = ""  # sensor_msgs/CameraInfo; "": the one beside the image's topic, or the only one
@@ -29,7 +29,7 @@ class BagTopics(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
 
 class BagMessage(NamedTuple):
-    """One message; `t_ns` is when the bag received it."""
+    """One message; `t_ns` is its receive time."""
 
     topic: str
     t_ns: int
@@ -37,7 +37,7 @@ class BagMessage(NamedTuple):
 
 
 class Bag:
-    """A bag that is open: a context. Raises BagError where it can't be opened or read on."""
+    """An open bag, a context manager. Raises BagError if it can't be opened or read."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -70,7 +70,7 @@ class Bag:
         return [topic for topic, kind in self.types.items() if kind in types and self.counts[topic]]
 
     def find(self, topic: str, *types: str) -> str:
-        """The topic, which must be there with one of these types. Raises BagError, which lists the topics."""
+        """Returns the topic if it has one of these types. Raises BagError, which lists the topics."""
         if self.types.get(topic) in types and self.counts[topic]:
             return topic
         kind = self.types.get(topic)
@@ -78,13 +78,13 @@ class Bag:
         raise BagError(f"{self.path}: {topic} {reason}; expected {' or '.join(types)}. {self.listing(*types)}")
 
     def listing(self, *types: str) -> str:
-        """What is there, for a message to the user: first those of the types asked for, else all."""
+        """Lists the topics of these types, else all, for a message."""
         fitting = self.of_type(*types)
         names = ", ".join(f"{topic} ({self.types[topic]})" for topic in fitting or self.types)
         return f"{'Such topics' if fitting else 'Its topics'}: {names or 'none'}"
 
     def messages(self, *topics: str) -> Iterator[BagMessage]:
-        """Those of some topics, in the order in which the bag received them."""
+        """Messages of some topics in receive order."""
         connections = [connection for connection in self._reader.connections if connection.topic in topics]
         if not connections:
             return
@@ -101,7 +101,7 @@ class Bag:
 
 
 def stamp_ns(content: Any) -> int:
-    """The time in a message's header."""
+    """The time in a message's header in ns."""
     stamp = content.header.stamp
     return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
 

@@ -1,4 +1,4 @@
-"""A ROS 2 bag that is written: a directory that appears when it is whole."""
+"""Writes a ROS 2 bag: a directory that appears once it is complete."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ Storage = Literal["mcap", "sqlite3"]
 
 
 class BagWriter:
-    """Writes messages of ROS 2 Humble to a bag in a directory that must not exist. A context; raises BagError.
+    """Writes messages of ROS 2 Humble to a bag in a new directory. A context manager; raises BagError.
 
-    It is written beside it and renamed at the end; where the context ends by an exception nothing is left.
+    The bag is written next to it and renamed at the end; after an exception nothing is left.
     """
 
     def __init__(self, directory: Path, storage: Storage = "mcap") -> None:
@@ -56,7 +56,7 @@ class BagWriter:
             shutil.rmtree(self._partial, ignore_errors=True)
 
     def write(self, topic: str, message: Any, t_ns: int) -> None:
-        """A message that the bag received at `t_ns`."""
+        """Writes a message with receive time `t_ns`."""
         kind = message.__msgtype__
         if topic not in self._connections:
             self._connections[topic] = self._writer.add_connection(
@@ -69,7 +69,7 @@ class BagWriter:
 
 
 def _qos(topic: str) -> list[Any]:
-    """What comes once must wait for those who come later: transient local; the rest by default."""
+    """Latched topics are transient local, so that late subscribers get them; the rest has the default."""
     if topic not in LATCHED:
         return []
     from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime

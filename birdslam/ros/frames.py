@@ -14,7 +14,7 @@ from birdslam.ros.bag import Bag
 from birdslam.trajectory import Transform, inverse, mount_pose, split_pose
 
 TF_STATIC = "/tf_static"
-# REP-105 and REP-120: the footprint lies on the road. Cars without one have their base_link there (Autoware, KITTI).
+# REP-105 and REP-120: the footprint is on the road. Cars without one have base_link there (Autoware, KITTI).
 ON_THE_ROAD = ("base_footprint", "base_link")
 
 
@@ -39,7 +39,7 @@ class StaticFrames:
                 self._from_parent[child] = parent, _matrix(one.transform)
 
     def find(self, parent: str, child: str) -> Transform | None:
-        """`T_parent_child` (4, 4); None where no chain of transforms joins the two."""
+        """`T_parent_child` (4, 4); None if no chain of transforms connects them."""
         to_root = [self._to_root(frame.lstrip("/")) for frame in (parent, child)]
         common = next((frame for frame in to_root[1] if frame in to_root[0]), None)
         if common is None:
@@ -61,9 +61,9 @@ class StaticFrames:
         return out
 
     def mount(self, camera: str) -> GroundPlane | None:
-        """The optical frame `camera` over the road; None where no transform reaches it.
+        """The optical frame `camera` over the road; None if no transform reaches it.
 
-        Raises ValueError where no camera of a car is mounted so.
+        Raises ValueError for a mount that is implausible for a car's camera.
         """
         found = ((base, self.find(base, camera)) for base in ON_THE_ROAD)
         base, T_base_cam = next(((base, pose) for base, pose in found if pose is not None), ("", None))

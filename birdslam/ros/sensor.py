@@ -1,6 +1,6 @@
-"""Images, camera calibrations and speeds of ROS messages as our own records.
+"""Converts images, camera calibrations and speeds of ROS messages to our records.
 
-After the definitions of sensor_msgs and geometry_msgs, and sensor_msgs/image_encodings.hpp.
+Definitions: sensor_msgs, geometry_msgs and sensor_msgs/image_encodings.hpp.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
 
 
 class Lens(NamedTuple):
-    """A camera without its place in the car, as the fields of `Camera` are named."""
+    """Camera intrinsics without the mounting, with the field names of `Camera`."""
 
     width_px: int
     height_px: int
@@ -141,17 +141,17 @@ def fix_row(message: Any, t_ns: int) -> str | None:
 
 
 def yaw_rate(message: Any) -> float:
-    """rad/s about z, of a message of one of SPEEDS."""
+    """Yaw rate in rad/s about z from a message of one of SPEEDS."""
     twist = message.twist
     return float((twist.twist if hasattr(twist, "covariance") else twist).angular.z)
 
 
 def _sigma(cov: Any, index: int, otherwise: float) -> float:
-    """A variance that is zero or negative means unknown in ROS."""
+    """1-sigma of a covariance; in ROS a variance of zero or below means unknown."""
     variance = 0.0 if cov is None else float(cov[index])
     return math.sqrt(variance) if math.isfinite(variance) and variance > 0.0 else otherwise
 
 
 def _field(message: Any, name: str) -> Any:
-    """ROS 1 writes the matrices of CameraInfo in capitals."""
+    """Reads a matrix of CameraInfo, whose name is in capitals in ROS 1."""
     return getattr(message, name) if hasattr(message, name) else getattr(message, name.upper())
