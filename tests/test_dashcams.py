@@ -14,7 +14,7 @@ import pytest
 
 from birdslam.calibration.lens import Lens, self_calibrate
 from birdslam.calibration.lens_windows import CornersOfImage, track_corners
-from birdslam.calibration.readout import USUAL
+from birdslam.calibration.readout import PRIOR
 from birdslam.geometry.camera import Undistorter
 from birdslam.odometry.odometry import Odometry
 from birdslam.perf.accuracy.drives import is_valid
@@ -72,7 +72,7 @@ def distance(name: str, first: int) -> tuple[float, float, float]:
             true_m += float(np.linalg.norm(at_m[k] - at_m[motion.from_frame]))
             sigmas.append(motion.scale_sigma_rel)
     speed_mps = float(np.linalg.norm(np.diff(at_m, axis=0), axis=1).mean()) * 10.0
-    shutter = shutter_rel(camera, camera.height_m, speed_mps, USUAL.sigma_s)
+    shutter = shutter_rel(camera, camera.height_m, speed_mps, PRIOR.sigma_s)
     return math.log(own_m / true_m), math.hypot(float(np.median(sigmas)), shutter), float(np.mean(valid))
 
 

@@ -189,7 +189,7 @@ def test_missing_directories_are_named(tmp_path: Path) -> None:
         (f"kitti:{tmp_path}", "not a KITTI recording"),
         ("kitti:", "expected kitti:DIR"),
         ("gopher:x", "unknown source 'gopher:'; choose from .*kitti:DIR"),
-        ("nothing", "unknown source 'nothing'; choose from .*kitti:DIR"),
+        ("nothing", "nothing: there is no such file.*kitti:DIR"),
     ):
         with pytest.raises(DatasetError, match=what):
             open_recording(uri)

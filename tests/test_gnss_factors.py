@@ -197,7 +197,7 @@ def test_points_of_a_long_drive_are_brought_into_the_map_so_many_at_a_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """However many there are, they take the same memory."""
-    monkeypatch.setattr(placed, "MAX_TOGETHER", 1000)
+    monkeypatch.setattr(placed, "MAX_FEATURE_POINTS", 1000)
     write_places(tmp_path, [Place(0, 0, SE2(), SE2(5.0, 0.0, 0.0))])
 
     def peak_bytes(points: int) -> int:

@@ -465,7 +465,7 @@ def test_a_sequence_with_images_is_driven_by_them_too(tmp_path: Path) -> None:
     never.with_suffix(".toml").write_text(tiny.DETECTOR.replace("classes = 2", "classes = 1"))
     without = {"models.shipped": False}
     asked = [*("tracking", str(root), "--frames", "0:6", "--seeds", "1", "--jobs", "1", "--output", str(out))]
-    with pytest.raises(ConfigurationError, match="needs a network that detects"):
+    with pytest.raises(ConfigurationError, match="needs a detector"):
         evaluate(options(*asked), load(None, without))
     configuration = load(None, without | {"models.detector.path": str(never)})
     assert evaluate(options(*asked, "--methods", "birdslam_live"), configuration) == 0
@@ -499,14 +499,14 @@ def test_a_trajectory_file_is_an_odometry(tmp_path: Path) -> None:
     ("arguments", "said"),
     [
         (["--sequences", "0007"], "no 0007"),
-        (["--methods", "orb"], "there is no orb"),
+        (["--methods", "orb"], "unknown orb; expected birdslam"),
         (["--odometry", "images"], "no image_02"),
         (["--detections", "network"], "no image_02 or image_03"),
         (["--frames", "30:10"], "expected all, paper or A:B"),
         (["--frames", "x"], "expected all, paper or A:B"),
         (["--seeds", "0"], "--seeds 0"),
         (["--odometry", "/nowhere.txt"], r"/nowhere\.txt: can't be read"),
-        (["--detections", "/nowhere"], r"/nowhere: has no detections"),
+        (["--detections", "/nowhere"], r"/nowhere: no detections of sequence 0002"),
     ],
 )
 def test_a_mistake_is_named(tmp_path: Path, arguments: list[str], said: str) -> None:
@@ -525,7 +525,7 @@ def test_a_speed_file_is_for_the_images_alone(tmp_path: Path) -> None:
     root = tracking_world.write(tmp_path / "root")
     asked = options("tracking", str(root), "--odometry", "truth", "--output", str(tmp_path / "out"))
     beside = Configuration(source=SourceConfig(speed=str(tmp_path)))
-    with pytest.raises(ConfigurationError, match="the odometry of 0002 fuses none"):
+    with pytest.raises(ConfigurationError, match="the odometry of 0002 does not use a speed"):
         evaluate(asked, beside)
 
 

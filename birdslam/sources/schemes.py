@@ -8,6 +8,7 @@ sources.
 from __future__ import annotations
 
 import pkgutil
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -145,6 +146,8 @@ def uri_of(text: str, schemes: Sequence[Scheme]) -> str:
     if scheme_of(text, schemes) is not None:
         return text
     path = Path(text).expanduser()
+    if not path.exists() and re.match(r"\w{2,}:", text):  # an address: `parse` names the schemes
+        return text
     if not path.exists():
         raise ValueError(f"{text}: there is no such file, and no such source; expected a path or {written(schemes)}")
     found = scheme_at(path, schemes) or (VIDEO if path.is_dir() else None)

@@ -20,5 +20,5 @@ def run(options: argparse.Namespace) -> int:
         from argcomplete.shell_integration import shellcode
     except ImportError:
         raise ConfigurationError("completion needs argcomplete: pip install birdslam[completion]") from None
-    print(shellcode(["birdslam"], shell=options.shell))
+    print(shellcode(["birdslam"], True, options.shell))
     return 0
