@@ -133,3 +133,27 @@ def test_the_python_of_the_readme(capsys: pytest.CaptureFixture[str]) -> None:
     assert printed
     assert all(re.fullmatch(line, text) for text in printed)
     assert re.search(line, readme)
+
+
+def test_the_boxes_of_the_readme_get_metres(capsys: pytest.CaptureFixture[str]) -> None:
+    """The block for supervision, over the first frames of the demo, with a box on the road for a detector."""
+    supervision = pytest.importorskip("supervision")
+    readme = (ROOT / "README.md").read_text()
+    frames, detector = "recording.undistorted_frames()", "sv.Detections.from_ultralytics(model(frame.image)[0])"
+    code = next(block for block in re.findall(r"```python\n(.*?)```", readme, re.DOTALL) if detector in block)
+
+    def detect() -> object:
+        box, one = np.array([[300.0, 90.0, 340.0, 120.0]]), np.array([0.9])
+        return supervision.Detections(xyxy=box, confidence=one, data={"class_name": np.array(["car"])})
+
+    recording = open_recording("demo")
+    names = {
+        "recording": recording,
+        "slam": birdslam.BirdSLAM.with_shipped_networks(recording.camera, recording.rate_hz),
+        "detect": detect,
+    }
+    code = code.replace(frames, f"islice({frames}, 12)").replace(detector, "detect()")
+    exec(f"from itertools import islice\n{code}", names)
+    distances = [float(line.split("]")[0].strip("[ ")) for line in capsys.readouterr().out.splitlines()]
+    assert len(distances) == 12
+    assert all(5.0 < distance < 60.0 for distance in distances[3:])
