@@ -34,8 +34,10 @@ from birdslam.lanes.ego_lane import EgoLane
 from birdslam.odometry.road.fit import RoadFit
 from birdslam.outputs.plain_words import DriveCounts, LengthsBy, verdict
 from birdslam.perception import Perception, Ready
-from birdslam.runtime.calibration.height import lengths_by, with_height
+from birdslam.runtime.calibration.given import lane_width_of
+from birdslam.runtime.calibration.height import lengths_by, with_height, with_known_lane
 from birdslam.runtime.cli.main import main
+from birdslam.runtime.configuration import ConfigurationError
 from birdslam.sources.camera_file import camera_text, load_camera
 from birdslam.sources.recording import DatasetError
 from birdslam.sources.speed_file import read_speed_curve
@@ -469,6 +471,29 @@ def counts(rests_on: LengthsBy) -> DriveCounts:
         frames=90, invalid_frames=0, invalid_by={}, statuses={}, speed_sources={}, path_m=90.0, valid_path_m=90.0,
         scale_sigma_rel=0.3, camera_sigma_rel=0.3, lengths_by=rests_on,
     )  # fmt: skip
+
+
+def test_a_known_lane_width_sets_the_height() -> None:
+    """The height is proportional to the width, and the prior of widths no longer widens its sigma."""
+    lanes = HeightCheck(cue="lanes", height_m=1.5, sigma_m=1.5 * math.hypot(0.4 / 3.4, 0.03), samples=900)
+    found = calibrated(1.5, (lanes,))
+    before, _ = with_height(found, False, None, "video:f.mp4")
+    for factor in (0.9, 1.0, 1.1):
+        camera, by = with_height(with_known_lane(found, 3.4 * factor, "video:f.mp4"), False, None, "video:f.mp4")
+        assert camera.height_m == pytest.approx(1.5 * factor)
+        assert camera.scale_sigma_rel == pytest.approx(math.hypot(0.03, 0.02))
+        assert camera.scale_sigma_rel < before.scale_sigma_rel
+        assert "the width of lanes" in by.words
+    assert with_known_lane(found, None, "video:f.mp4") is found
+    with pytest.raises(CalibrationError, match="painted lines"):
+        with_known_lane(calibrated(1.5, ()), 3.5, "video:f.mp4")
+
+
+@pytest.mark.parametrize("text", ["3.5", "lane", "lane=", "lane=nan", "lane=60", "car=4.4x1.8x1.45"])
+def test_a_known_length_that_can_not_be_used_is_refused(text: str) -> None:
+    with pytest.raises(ConfigurationError, match="expected lane=METRES"):
+        lane_width_of(text)
+    assert lane_width_of("lane=3.5") == 3.5
 
 
 def test_a_films_sigma_has_the_time_of_its_rows_in_it() -> None:

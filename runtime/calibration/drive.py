@@ -25,6 +25,7 @@ from birdslam.runtime.calibration.height import (
     known_lengths,
     lengths_by,
     with_height,
+    with_known_lane,
 )
 from birdslam.runtime.calibration.lens import corners_of_drive, lens_of_drive
 from birdslam.runtime.calibration.report import report
@@ -102,6 +103,7 @@ def calibrate_drive(
             if must_show:
                 raise CalibrationError(f"{uri}: {error}") from None
             found = _assumed(recording.camera, pitch, str(error))
+    found = with_known_lane(found, given.lane_m, uri)
     camera, height_by = with_height(found, known_height, lens, uri, readout)
     return Calibrated(
         camera,

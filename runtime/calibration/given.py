@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -37,6 +38,21 @@ class Given:
     fov_deg: float | None = None  # horizontal field of view, for an unknown lens
     kind: str = "dashcam"  # kind of camera, if the field of view is unknown too
     speed: Path | None = None  # lines of time in s, speed in m/s
+    lane_m: float | None = None  # width of the drive's lanes
+
+
+def lane_width_of(text: str | None) -> float | None:
+    """Parses `--known-length lane=3.5`. Raises ConfigurationError."""
+    if text is None:
+        return None
+    what, _, number = text.partition("=")
+    try:
+        width_m = float(number)
+    except ValueError:
+        width_m = math.nan
+    if what != "lane" or not 2.0 <= width_m <= 6.0:
+        raise ConfigurationError(f"--known-length {text}: expected lane=METRES, a width of 2 to 6 m")
+    return width_m
 
 
 def lens_of(given: Given, uri: str, topics: BagTopics) -> tuple[Intrinsics | None, float | None]:

@@ -71,7 +71,8 @@ def run(options: argparse.Namespace) -> int:
         options.model = list(_networks(configuration, options.yes))
         configuration = configuration_of(options)
     configuration = _with_film_gnss(configuration)
-    if options.height is None and lens is None and (scheme is not VIDEO or configuration.camera is not None):
+    stated = (options.height, lens, options.known_length)
+    if all(each is None for each in stated) and (scheme is not VIDEO or configuration.camera is not None):
         return run_processes(configuration)
     configuration, lengths_by = _calibrated(configuration, options, lens)
     return run_processes(configuration, lengths_by)
@@ -154,18 +155,28 @@ def _calibrated(
     """
     # A late import: it loads the whole front end
     from birdslam.runtime.calibration.drive import ROUGH, calibrate_drive
-    from birdslam.runtime.calibration.given import Given
+    from birdslam.runtime.calibration.given import Given, lane_width_of
     from birdslam.runtime.calibration.report import write_camera_file
 
     source = configuration.source
     if configuration.camera is not None:
-        raise ConfigurationError("--height: the camera file has a height already; leave --height out or edit the file")
+        raise ConfigurationError(
+            "--height, --known-length: the camera file has a height already; leave them out or edit the file"
+        )
     if is_live(source.uri):
         raise ConfigurationError(
-            f"--height: {source.uri} is live and has no first pass; run `birdslam calibrate` on a film of this camera"
+            f"--height, --known-length: {source.uri} is live and has no first pass; "
+            "run `birdslam calibrate` on a film of this camera"
         )
     speed = Path(source.speed).expanduser() if source.speed else None
-    given = Given(intrinsics=lens, height_m=options.height, fov_deg=options.fov, kind=options.kind, speed=speed)
+    given = Given(
+        intrinsics=lens,
+        height_m=options.height,
+        fov_deg=options.fov,
+        kind=options.kind,
+        speed=speed,
+        lane_m=lane_width_of(options.known_length),
+    )
     found = calibrate_drive(configuration, source.uri, given, source.stride, ROUGH, must_show=False)
     path = Path(configuration.output) / "camera.toml"
     write_camera_file(path, found.camera, found.report)
