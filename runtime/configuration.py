@@ -72,6 +72,7 @@ __all__ = [
     "without_passwords",
 ]
 
+FILM = "film"  # value of --gnss and --speed: the track inside the film
 NO_MODEL = "none"  # value of --model: no shipped network
 WATCHDOG_S, LOSSLESS_WATCHDOG_S = 2.0, 60.0  # the latter at rate "max", on slow computers too
 _USER = re.compile(r"(?<=://)[^/@]*@")
@@ -258,7 +259,7 @@ def _anchor_paths(tree: dict[str, Any], base: Path) -> None:
 
     def anchor(table: Any, *keys: str) -> None:
         for key in keys:
-            if isinstance(table, dict) and isinstance(table.get(key), str) and table[key]:
+            if isinstance(table, dict) and isinstance(table.get(key), str) and table[key] not in ("", FILM):
                 table[key] = str(base / Path(table[key]).expanduser())
 
     anchor(tree, "camera", "output")

@@ -25,7 +25,8 @@ class SourceConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     uri: str = ""  # source of frames, see docs/sources.md: video:FILE, v4l2:/dev/videoN, ...
     rate: Positive | Literal["max"] | None = None  # Hz; None: by the source's time stamps; "max": lossless
     stride: PositiveInt = 1  # use every n-th frame of a recording
-    speed: str = ""  # FILE with the car's speed for a recording: lines of time in s, speed in m/s; "": none
+    # FILE with the car's speed for a recording: lines of time in s, speed in m/s; "film": inside it; "": none
+    speed: str = ""
     # FILE with external odometry for a recording, instead of visual odometry: TUM lines or KITTI rows; "": none
     odometry: str = ""
     detections: str = ""  # FILE with external detections for a recording: MOT, KITTI tracking or COCO; "": none
@@ -239,7 +240,7 @@ class ResultsConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     smooth: bool = False  # write final trajectories by the RTS smoother: tracks/ID.final.tum.txt, ego.final.*
     video: str = ""  # FILE.mp4: the frames with the estimated boxes beside the bird's-eye view; "": none
     map: str = ""  # FILE: the map to localise in and to extend; "": none
-    gnss: str = ""  # FILE: GNSS fixes that georeference the drive and its map; "": none
+    gnss: str = ""  # FILE: GNSS fixes that georeference the drive and its map; "film": inside it; "": none
     gnss_offset_s: float | None = None  # from the first fix of the file to the first frame; None: by clocks and shapes
     map_only: str = ""  # FILE: the map to localise in without extending it; "": none
 

@@ -35,7 +35,7 @@ from birdslam.odometry.road.fit import RoadFit
 from birdslam.outputs.plain_words import DriveCounts, LengthsBy, verdict
 from birdslam.perception import Perception, Ready
 from birdslam.runtime.calibration.given import lane_width_of
-from birdslam.runtime.calibration.height import lengths_by, with_height, with_known_lane
+from birdslam.runtime.calibration.height import lengths_by, with_height
 from birdslam.runtime.cli.main import main
 from birdslam.runtime.configuration import ConfigurationError
 from birdslam.sources.camera_file import camera_text, load_camera
@@ -473,20 +473,14 @@ def counts(rests_on: LengthsBy) -> DriveCounts:
     )  # fmt: skip
 
 
-def test_a_known_lane_width_sets_the_height() -> None:
-    """The height is proportional to the width, and the prior of widths no longer widens its sigma."""
-    lanes = HeightCheck(cue="lanes", height_m=1.5, sigma_m=1.5 * math.hypot(0.4 / 3.4, 0.03), samples=900)
-    found = calibrated(1.5, (lanes,))
-    before, _ = with_height(found, False, None, "video:f.mp4")
-    for factor in (0.9, 1.0, 1.1):
-        camera, by = with_height(with_known_lane(found, 3.4 * factor, "video:f.mp4"), False, None, "video:f.mp4")
-        assert camera.height_m == pytest.approx(1.5 * factor)
-        assert camera.scale_sigma_rel == pytest.approx(math.hypot(0.03, 0.02))
-        assert camera.scale_sigma_rel < before.scale_sigma_rel
-        assert "the width of lanes" in by.words
-    assert with_known_lane(found, None, "video:f.mp4") is found
-    with pytest.raises(CalibrationError, match="painted lines"):
-        with_known_lane(calibrated(1.5, ()), 3.5, "video:f.mp4")
+@pytest.mark.parametrize("width_m", [2.8, 3.4, 3.9])
+def test_a_known_lane_width_sets_the_height(width_m: float) -> None:
+    """The height is proportional to the width, and the spread of usual widths no longer widens its sigma."""
+    seen = [LaneWidth(3.4, 1.0)] * 60
+    (usual,) = checks_by_lanes(seen, 1.5, 0.004)
+    (known,) = checks_by_lanes(seen, 1.5, 0.004, width_m)
+    assert known.height_m == pytest.approx(1.5 * width_m / 3.4)
+    assert known.sigma_m / known.height_m < 0.5 * usual.sigma_m / usual.height_m
 
 
 @pytest.mark.parametrize("text", ["3.5", "lane", "lane=", "lane=nan", "lane=60", "car=4.4x1.8x1.45"])

@@ -1,4 +1,4 @@
-"""GNSS tracks inside films: containers as cameras write them, made here, and read by the real ExifTool."""
+"""GNSS tracks inside films: containers as cameras write them, made here and read by ExifTool."""
 
 from __future__ import annotations
 
@@ -12,15 +12,20 @@ import cv2
 import numpy as np
 import pytest
 
+from birdslam.geometry.se2 import SE2
+from birdslam.loops.gnss.earth import EarthError
 from birdslam.loops.gnss.files import GnssError, read_fixes
+from birdslam.outputs.earth_files import GeoLine, write_geo_lines
 from birdslam.runtime.cli.main import main
-from birdslam.runtime.maps.film_gnss import FilmFix, read_film, track_of_films, write_gpx
+from birdslam.runtime.configuration import FILM, load
+from birdslam.runtime.maps.film_gnss import FilmFix, read_film, track_of_films
+from birdslam.runtime.supervision.final_results import GNSS_UNUSED, FinalResults
 from birdslam.sources.speed_file import read_speeds
+from tests.test_results import estimate
 
 exiftool = pytest.mark.skipif(shutil.which("exiftool") is None, reason="ExifTool is not installed")
 BEGIN = datetime(2023, 6, 1, 12, 30, 10, tzinfo=UTC)
-FIXES = [FilmFix(BEGIN + timedelta(seconds=k), 48.1 + 1e-4 * k, -11.5 - 2e-4 * k, 10.0 + k) for k in range(5)]
-KNOT_MPS = 0.514444
+FIXES = [FilmFix(48.1 + 1e-4 * k, -11.5 - 2e-4 * k, BEGIN + timedelta(seconds=k)) for k in range(5)]
 
 
 def film(path: Path) -> bytes:
@@ -58,11 +63,10 @@ def novatek(data: bytes, fixes: list[FilmFix]) -> bytes:
     """`free` boxes with a fix a second before a `moov` with their index (Viofo A119 V3)."""
     blocks = []
     for fix in fixes:
-        t, (north, east) = fix.utc, sides(fix)
-        speed = (fix.speed_mps or 0.0) / KNOT_MPS
+        t, (north, east) = fix.utc or BEGIN, sides(fix)
         body = struct.pack("<6I", t.hour, t.minute, t.second, t.year - 2000, t.month, t.day)
         body += b"A" + north.encode() + east.encode() + b"\0"
-        body += struct.pack("<4f", minutes(fix.latitude_deg), minutes(fix.longitude_deg), speed, 0.0)
+        body += struct.pack("<4f", minutes(fix.latitude_deg), minutes(fix.longitude_deg), 9.0, 0.0)
         blocks.append(box(b"free", (b"GPS " + struct.pack("<I", 0x3F0) + body).ljust(1016, b"\0")))
     at = data.rindex(b"moov") - 4
     head = data[:at] + b"".join(blocks)
@@ -77,18 +81,50 @@ def blackvue(data: bytes, fixes: list[FilmFix]) -> bytes:
     lines = []
     for fix in fixes:
         north, east = sides(fix)
-        knots = (fix.speed_mps or 0.0) / KNOT_MPS
-        body = f"GPRMC,{fix.utc:%H%M%S}.00,A,{minutes(fix.latitude_deg):010.5f},{north},"
-        body += f"{minutes(fix.longitude_deg):011.5f},{east},{knots:.3f},0.0,{fix.utc:%d%m%y},,,A"
+        utc = fix.utc or BEGIN
+        body = f"GPRMC,{utc:%H%M%S}.00,A,{minutes(fix.latitude_deg):010.5f},{north},"
+        body += f"{minutes(fix.longitude_deg):011.5f},{east},9.0,0.0,{utc:%d%m%y},,,A"
         check = 0
         for character in body.encode():
             check ^= character
-        lines.append(f"[{round(fix.utc.timestamp() * 1000)}]${body}*{check:02X}\r\n")
+        lines.append(f"[{round(utc.timestamp() * 1000)}]${body}*{check:02X}\r\n")
     return data + box(b"free", box(b"gps ", "".join(lines).encode() + b"\0"))
 
 
+def gopro(data: bytes, fixes: list[FilmFix]) -> bytes:
+    """A track of GPMF samples, one a second, with 18 equal positions each (GoPro HERO5 to HERO10)."""
+
+    def klv(key: bytes, kind: bytes, size: int, count: int, content: bytes) -> bytes:
+        return key + kind + struct.pack(">BH", size, count) + content.ljust((len(content) + 3) // 4 * 4, b"\0")
+
+    def nested(key: bytes, content: bytes) -> bytes:
+        return klv(key, b"\0", 1, len(content), content)
+
+    samples = []
+    for fix in fixes:
+        scaled = (fix.latitude_deg * 1e7, fix.longitude_deg * 1e7, 0.0, 9e3, 0.0)
+        date = b"" if fix.utc is None else klv(b"GPSU", b"U", 16, 1, f"{fix.utc:%y%m%d%H%M%S}.000".encode())
+        stream = date
+        stream += klv(b"SCAL", b"l", 4, 5, struct.pack(">5i", 10_000_000, 10_000_000, 1000, 1000, 100))
+        stream += klv(b"GPS5", b"l", 20, 18, struct.pack(">5i", *map(round, scaled)) * 18)
+        samples.append(nested(b"DEVC", klv(b"DVID", b"L", 4, 1, b"\0\0\0\1") + nested(b"STRM", stream)))
+    at, count = data.rindex(b"moov") - 4, len(samples)
+    table = box(b"stsd", struct.pack(">2I", 0, 1) + box(b"gpmd", b"\0" * 6 + b"\0\1" + b"\0" * 4))
+    table += box(b"stts", struct.pack(">4I", 0, 1, count, 1000))
+    table += box(b"stsc", struct.pack(">5I", 0, 1, 1, count, 1))
+    table += box(b"stsz", struct.pack(">3I", 0, 0, count) + b"".join(struct.pack(">I", len(each)) for each in samples))
+    table += box(b"stco", struct.pack(">3I", 0, 1, at + 8))
+    head = box(b"mdhd", struct.pack(">6I", 0, 0, 0, 1000, 1000 * count, 0))
+    head += box(b"hdlr", b"\0" * 8 + b"meta" + b"\0" * 13)
+    media = box(b"mdia", head + box(b"minf", box(b"stbl", table)))
+    track = box(b"trak", box(b"tkhd", b"\0" * 84) + media)
+    end = struct.unpack(">I", data[at : at + 4])[0]
+    moov = struct.pack(">I", end + len(track)) + data[at + 4 :] + track
+    return data[:at] + box(b"mdat", b"".join(samples)) + moov
+
+
 @exiftool
-@pytest.mark.parametrize("container", [novatek, blackvue])
+@pytest.mark.parametrize("container", [novatek, blackvue, gopro])
 def test_a_track_inside_a_film_is_read(container: Callable[[bytes, list[FilmFix]], bytes], tmp_path: Path) -> None:
     path = tmp_path / "film.mp4"
     path.write_bytes(container(film(path), FIXES))
@@ -97,14 +133,13 @@ def test_a_track_inside_a_film_is_read(container: Callable[[bytes, list[FilmFix]
     for fix, true in zip(found, FIXES, strict=True):
         assert fix.latitude_deg == pytest.approx(true.latitude_deg, abs=1e-5)  # Novatek: single precision
         assert fix.longitude_deg == pytest.approx(true.longitude_deg, abs=1e-5)
-        assert fix.speed_mps == pytest.approx(true.speed_mps, abs=0.01)
     assert cv2.VideoCapture(str(path)).read()[0]  # it is a film still
 
 
 @exiftool
 def test_the_null_point_is_no_fix(tmp_path: Path) -> None:
     path = tmp_path / "film.mp4"
-    lost = [FilmFix(BEGIN, 0.0, 0.0, 0.0), *FIXES[1:]]
+    lost = [FilmFix(0.0, 0.0, BEGIN), *FIXES[1:]]
     path.write_bytes(novatek(film(path), lost))
     assert len(read_film(path)) == len(FIXES) - 1
 
@@ -119,13 +154,40 @@ def test_films_of_a_drive_give_one_track(tmp_path: Path) -> None:
     assert np.diff(times_ns).tolist() == [1_000_000_000] * (len(FIXES) - 1)
 
 
-def test_the_written_track_is_read_as_fixes_and_as_speeds(tmp_path: Path) -> None:
-    path = tmp_path / "film.gpx"
-    write_gpx(path, FIXES)
-    fixes = read_fixes(path.read_bytes(), "film.gpx", 0)
-    assert [fix.speed_mps for fix in fixes] == [fix.speed_mps for fix in FIXES]
-    assert fixes[-1].t_source_ns - fixes[0].t_source_ns == 4_000_000_000
-    assert max(reading.speed_mps for reading in read_speeds(path).readings) == pytest.approx(14.0)
+def undated(path: Path) -> None:
+    """A film whose fixes have times in the film alone."""
+    fixes = [FilmFix(fix.latitude_deg, fix.longitude_deg, None) for fix in FIXES]
+    path.write_bytes(gopro(film(path), fixes))
+
+
+@exiftool
+def test_the_track_is_read_as_fixes_and_as_speeds(tmp_path: Path) -> None:
+    path, track = tmp_path / "film.mp4", tmp_path / "film.gpx"
+    path.write_bytes(gopro(film(path), FIXES))
+    assert track_of_films([path], track) == len(FIXES)
+    assert len(read_fixes(track.read_bytes(), "film.gpx", 0)) == len(FIXES)
+    step_m = np.hypot(1e-4, 2e-4 * np.cos(np.radians(48.1))) * np.pi / 180.0 * 6_371_000.0
+    speeds = [reading.speed_mps for reading in read_speeds(track).readings]
+    assert speeds == pytest.approx([step_m] * len(speeds), rel=0.01)  # a step a second
+
+
+@exiftool
+def test_fixes_without_a_date_have_the_times_of_their_film(tmp_path: Path) -> None:
+    path, track = tmp_path / "film.mp4", tmp_path / "film.gpx"
+    undated(path)
+    assert track_of_films([path], track) == len(FIXES)
+    times_ns = [fix.t_source_ns for fix in read_fixes(track.read_bytes(), "film.gpx", 0)]
+    assert np.diff(times_ns).tolist() == [1_000_000_000] * (len(FIXES) - 1)
+    undated(tmp_path / "film2.mp4")
+    with pytest.raises(GnssError, match="have no date"):
+        track_of_films([path, tmp_path / "film2.mp4"], track)
+
+
+@exiftool
+def test_a_single_fix_is_no_track(tmp_path: Path) -> None:
+    path = tmp_path / "film.mp4"
+    path.write_bytes(novatek(film(path), FIXES[:1]))
+    assert track_of_films([path], tmp_path / "film.gpx") == 0
 
 
 @exiftool
@@ -157,3 +219,25 @@ def test_without_exiftool_the_remedy_is_named(
     assert "apt install libimage-exiftool-perl" in capsys.readouterr().err
     assert main(["demo", "--gnss", "film", "--output", str(tmp_path / "out")]) == 2
     assert "no film" in capsys.readouterr().err
+
+
+def test_a_found_track_that_does_not_fit_costs_no_other_result(tmp_path: Path) -> None:
+    """A requested one is an error, since its results are missing."""
+    track = tmp_path / "film.gpx"
+    write_geo_lines(track, [GeoLine("film", np.array([[48.0, 11.0], [49.0, 11.0]]), [0, 1_000_000_000])])
+    overrides = {"source.uri": "demo", "output": str(tmp_path)}
+    found = FinalResults(load(None, overrides), None, track)
+    requested = FinalResults(load(None, {**overrides, "results.gnss": str(track)}), None)
+    for final in (found, requested):
+        assert final.map is not None
+        final.map.add(estimate(0, SE2()))
+    assert "within the drive" in found.write(())[GNSS_UNUSED]
+    with pytest.raises(EarthError, match="within the drive"):
+        requested.write(())
+
+
+def test_a_configuration_file_names_the_track_inside_the_film(tmp_path: Path) -> None:
+    path = tmp_path / "car.toml"
+    path.write_text('[results]\ngnss = "film"\n[source]\nspeed = "film"\n')
+    configuration = load(path)
+    assert (configuration.results.gnss, configuration.source.speed) == (FILM, FILM)

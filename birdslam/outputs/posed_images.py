@@ -24,6 +24,8 @@ _PIXEL_CENTRE = 0.5  # COLMAP's and nerfstudio's first pixel has its centre at (
 _MAX_ERROR_RAD = 0.003  # RMS of the reprojection, at which a point is an outlier
 _MIN_ANGLE_RAD = 0.02  # between the rays of a point
 _MIN_VIEWS = 3
+_MIN_DEPTH_M = 0.1
+_STEPS = 3  # of Gauss-Newton
 _OPENGL_AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # camera axes x right, y up, z back
 
 
@@ -85,16 +87,18 @@ class PosedImages:
         across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
         p = np.linalg.solve(across.sum(axis=0), np.einsum("nij,nj->i", across, poses[:, :3, 3]))
         focal = np.array([self.camera.fx_px, self.camera.fy_px])
-        R = np.swapaxes(poses[:, :3, :3], 1, 2)
-        for _ in range(3):
+        R, rms_px = np.swapaxes(poses[:, :3, :3], 1, 2), np.inf
+        for step in range(_STEPS + 1):
             q = np.einsum("nij,nj->ni", R, p - poses[:, :3, 3])
-            if (q[:, 2] < 0.1).any():
+            if (q[:, 2] < _MIN_DEPTH_M).any():
                 return None
             by_z = 1.0 / q[:, 2]
             xy = q[:, :2] * by_z[:, None]
             error = (xy - self.camera.to_xy(px)) * focal
+            if step == _STEPS:
+                rms_px = float(np.sqrt((error**2).sum(axis=1).mean()))
+                break
             J = (R[:, :2] - xy[:, :, None] * R[:, 2:]) * by_z[:, None, None] * focal[:, None]
-            rms_px = float(np.sqrt((error**2).sum(axis=1).mean()))
             p = p - np.linalg.lstsq(J.reshape(-1, 3), error.ravel(), rcond=None)[0]
         if rms_px > _MAX_ERROR_RAD * self.camera.fx_px:
             return None

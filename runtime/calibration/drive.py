@@ -10,7 +10,9 @@ import cv2
 import msgspec
 
 from birdslam.calibration.calibration import Calibration, CalibrationConfig, CalibrationError, calibrate
+from birdslam.calibration.height_check import LANES
 from birdslam.calibration.intrinsics import Intrinsics
+from birdslam.calibration.lane_width import MIN_DISTANCE_M
 from birdslam.calibration.lens_windows import CornersOfImage
 from birdslam.calibration.readout import Readout, readout_of_drive
 from birdslam.calibration.travel import TravelPitch
@@ -25,7 +27,6 @@ from birdslam.runtime.calibration.height import (
     known_lengths,
     lengths_by,
     with_height,
-    with_known_lane,
 )
 from birdslam.runtime.calibration.lens import corners_of_drive, lens_of_drive
 from birdslam.runtime.calibration.report import report
@@ -87,6 +88,7 @@ def calibrate_drive(
     known_height = height_m is not None or lens is None  # a recording with its own calibration has the height
     cv2.setNumThreads(configuration.perceive.opencv_threads)
     configuration = configuration.as_lossless()
+    config = msgspec.structs.replace(config, known_lane_m=given.lane_m)
     with Inference(configuration) as inference:
 
         def drive() -> Iterator[tuple[Frame, Pending]]:
@@ -103,7 +105,8 @@ def calibrate_drive(
             if must_show:
                 raise CalibrationError(f"{uri}: {error}") from None
             found = _assumed(recording.camera, pitch, str(error))
-    found = with_known_lane(found, given.lane_m, uri)
+    if given.lane_m is not None and not any(check.cue == LANES for check in found.height_checks):
+        raise CalibrationError(f"{uri}: --known-length lane: less than {MIN_DISTANCE_M:g} m between two painted lines")
     camera, height_by = with_height(found, known_height, lens, uri, readout)
     return Calibrated(
         camera,

@@ -15,7 +15,6 @@ from birdslam.calibration.height_check import LANES, VEHICLES, HeightCheck, Know
 from birdslam.calibration.intrinsics import Intrinsics
 from birdslam.calibration.readout import Readout
 from birdslam.geometry.camera import Camera
-from birdslam.lanes.topology import WIDTH_M, WIDTH_SIGMA_M
 from birdslam.outputs.plain_words import LengthsBy
 from birdslam.sources.recording import Recording, check_times
 from birdslam.sources.speed_file import read_speed_curve
@@ -24,7 +23,6 @@ from birdslam.types import NS_PER_S
 UNKNOWN_HEIGHT_M = 1.5  # placeholder: all lengths are proportional to it, and it is replaced
 COUNTRY_SIGMA_REL = 0.08  # of the height from the size of cars, which differs between countries (docs/calibration.md)
 WINDSCREEN_M, WINDSCREEN_SIGMA_REL = 1.35, 0.2  # prior: behind a car's windscreen, 1.1 to 1.6 m; by judgement
-KNOWN_SIGMA_REL = 0.02  # of a stated lane width: from one side of the paint to the other, by judgement
 AGREES_SIGMA = 2.0
 SIZES = (VEHICLES, LANES)  # cues for the height alone; the others constrain height and focal length together
 _SHUTTER_PER_M2 = 0.066  # docs/constants.md
@@ -68,26 +66,6 @@ class HeightBy(NamedTuple):
     def a_length(self) -> bool:
         """Whether a known length determined it, which constrains height and focal length together."""
         return any(check.cue not in SIZES for check in self.checks)
-
-
-def with_known_lane(found: Calibration, lane_m: float | None, uri: str) -> Calibration:
-    """Replaces the prior of the lane width by the stated width of the drive's lanes; None: leaves it.
-
-    The height is proportional to the lane width (`checks_by_lanes`). Raises CalibrationError without painted lanes.
-    """
-    if lane_m is None:
-        return found
-    if not any(check.cue == LANES for check in found.height_checks):
-        raise CalibrationError(f"{uri}: --known-length lane: the car drives less than 20 m between two painted lines")
-    checks = tuple(_at_lane_width(check, lane_m) if check.cue == LANES else check for check in found.height_checks)
-    return msgspec.structs.replace(found, height_checks=checks)
-
-
-def _at_lane_width(check: HeightCheck, lane_m: float) -> HeightCheck:
-    height_m = check.height_m * lane_m / WIDTH_M
-    measured_rel = max((check.sigma_m / check.height_m) ** 2 - (WIDTH_SIGMA_M / WIDTH_M) ** 2, 0.0)
-    sigma_rel = math.sqrt(measured_rel + KNOWN_SIGMA_REL**2)
-    return msgspec.structs.replace(check, height_m=height_m, sigma_m=height_m * sigma_rel)
 
 
 def with_height(

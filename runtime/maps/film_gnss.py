@@ -16,29 +16,34 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from birdslam.loops.gnss.earth import is_on_earth
 from birdslam.loops.gnss.files import GnssError
+from birdslam.outputs.earth_files import GeoLine, write_geo_lines
+from birdslam.types import NS_PER_S
 
-FILM = "film"  # `--gnss film`, `--speed film`
 TRACK_FILE = "film.gpx"
 INSTALL = "ExifTool reads it: apt install libimage-exiftool-perl"
 _PROGRAM = "exiftool"
-_TAGS = ("GPSLatitude", "GPSLongitude", "GPSSpeed", "GPSSpeedRef", "GPSDateTime", "SampleTime")
-_MPS = {"K": 1.0 / 3.6, "M": 0.44704, "N": 0.514444}  # by GPSSpeedRef; ExifTool's default is km/h
+_TAGS = ("-GPSLatitude", "-GPSLongitude", "-GPSDateTime", "-SampleTime")
 _LIMIT_S = 120.0
 _DATE_TIME = re.compile(r"(\d{4}):(\d\d):(\d\d) (\d\d):(\d\d):(\d\d)(\.\d+)?(Z|[+-]\d\d:\d\d)?")
-_UNKNOWN_DATE = datetime(2000, 1, 1, tzinfo=UTC)  # of a track with times in the film alone
 
 
 @dataclass(frozen=True)
 class FilmFix:
-    """A fix: UTC, position in degrees, speed in m/s if the camera states it."""
+    """A fix: position in degrees at UTC, or at the time in the film (s) if the camera has no date."""
 
-    utc: datetime
     latitude_deg: float
     longitude_deg: float
-    speed_mps: float | None
+    utc: datetime | None
+    t_film_s: float | None = None
+
+    @property
+    def t_ns(self) -> int:
+        """Time since 1970, or since the start of the film."""
+        return round((self.utc.timestamp() if self.utc else self.t_film_s or 0.0) * NS_PER_S)
 
 
 def is_readable() -> bool:
@@ -50,17 +55,7 @@ def read_film(path: Path) -> list[FilmFix]:
     """Reads the fixes of a film in its order, without those of a receiver that has no position. Raises GnssError."""
     if not is_readable():
         raise GnssError(f"{path}: its GNSS track is inside the film; {INSTALL}")
-    command = [
-        _PROGRAM,
-        "-ee3",
-        "-json",
-        "-n",
-        "-G3",
-        "-a",
-        "-api",
-        "LargeFileSupport=1",
-        *(f"-{tag}" for tag in _TAGS),
-    ]
+    command = [_PROGRAM, "-ee", "-json", "-n", "-G3", "-api", "LargeFileSupport=1", *_TAGS]
     try:
         done = subprocess.run([*command, "--", str(path)], capture_output=True, check=False, timeout=_LIMIT_S)
         (tags,) = msgspec.json.decode(done.stdout, type=list[dict[str, Any]])
@@ -78,52 +73,46 @@ def read_film(path: Path) -> list[FilmFix]:
     return [fix for fix in found if fix is not None]
 
 
-def write_gpx(path: Path, fixes: Sequence[FilmFix]) -> None:
-    """Writes fixes as a GPX track with speeds. Raises OSError."""
-    points = []
-    for fix in fixes:
-        speed = "" if fix.speed_mps is None else f"<speed>{fix.speed_mps:.3f}</speed>"
-        time = fix.utc.isoformat(timespec="milliseconds").replace("+00:00", "Z")
-        place = f'lat="{fix.latitude_deg:.8f}" lon="{fix.longitude_deg:.8f}"'
-        points.append(f"<trkpt {place}><time>{time}</time>{speed}</trkpt>")
-    head = '<?xml version="1.0" encoding="UTF-8"?>\n<gpx version="1.0" creator="birdslam" '
-    head += 'xmlns="http://www.topografix.com/GPX/1/0"><trk><trkseg>'
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text("\n".join([head, *points, "</trkseg></trk></gpx>", ""]), encoding="utf-8")
-
-
 def track_of_films(films: Sequence[Path], path: Path) -> int:
-    """Writes the fixes of films, one after the other, as a GPX track; returns their number. Raises GnssError."""
+    """Writes the fixes of films, one after the other, as a GPX track; returns their number, 0 for a single fix.
+
+    Speeds are left out, since their unit differs between cameras. Raises GnssError.
+    """
     fixes = [fix for film in films for fix in read_film(film)]
-    if fixes:
-        try:
-            write_gpx(path, sorted(fixes, key=lambda fix: fix.utc))
-        except OSError as error:
-            raise GnssError(f"{path}: can't be written: {error.strerror}") from None
+    if len(films) > 1 and any(fix.utc is None for fix in fixes):
+        raise GnssError(f"{films[0].parent}: the fixes inside the films have no date, so their order is unknown")
+    if len(fixes) < 2:
+        return 0
+    fixes.sort(key=lambda fix: fix.t_ns)
+    degrees = np.array([(fix.latitude_deg, fix.longitude_deg) for fix in fixes])
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_geo_lines(path, [GeoLine(films[0].stem, degrees, [fix.t_ns for fix in fixes])])
+    except OSError as error:
+        raise GnssError(f"{path}: can't be written: {error.strerror}") from None
     return len(fixes)
 
 
 def _fix(sample: dict[str, Any]) -> FilmFix | None:
     try:
         latitude, longitude = float(sample["GPSLatitude"]), float(sample["GPSLongitude"])
-        speed = float(sample["GPSSpeed"]) if "GPSSpeed" in sample else None
     except (KeyError, TypeError, ValueError):
         return None
-    utc = _utc(str(sample.get("GPSDateTime", "")), sample.get("SampleTime"))
-    if utc is None or not is_on_earth(latitude, longitude) or (latitude == 0.0 and longitude == 0.0):
+    utc, t_film_s = _utc(str(sample.get("GPSDateTime", ""))), sample.get("SampleTime")
+    is_timed = utc is not None or isinstance(t_film_s, int | float)
+    if not is_timed or not is_on_earth(latitude, longitude) or (latitude == 0.0 and longitude == 0.0):
         return None
-    unit = _MPS.get(str(sample.get("GPSSpeedRef", "K"))[:1].upper(), _MPS["K"])
-    return FilmFix(utc, latitude, longitude, None if speed is None or speed < 0.0 else speed * unit)
+    return FilmFix(latitude, longitude, utc, t_film_s)
 
 
-def _utc(text: str, sample_s: Any) -> datetime | None:
+def _utc(text: str) -> datetime | None:
     found = _DATE_TIME.match(text)
     if found is None:
-        return _UNKNOWN_DATE + timedelta(seconds=float(sample_s)) if isinstance(sample_s, int | float) else None
+        return None
     zone = found[8] if found[8] and found[8] != "Z" else "+00:00"
+    second = "{}-{}-{}T{}:{}:{}".format(*found.groups()[:6])
     try:
-        second = "{}-{}-{}T{}:{}:{}".format(*found.groups()[:6])
-        whole = datetime.fromisoformat(second + zone).astimezone(UTC)
+        whole = datetime.fromisoformat(second + zone)
+        return whole.astimezone(UTC) + timedelta(seconds=float(found[7] or 0.0))
     except (ValueError, OverflowError):
         return None
-    return whole + timedelta(seconds=float(found[7] or 0.0))

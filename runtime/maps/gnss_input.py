@@ -54,13 +54,16 @@ def recorded_fixes(configuration: Configuration) -> Fixes | None:
     if name.startswith(TOPIC):
         found = _of_bag(configuration, name.removeprefix(TOPIC))
         return lambda begin_ns: Track(found)
-    path = Path(name).expanduser()
+    return fixes_of_file(Path(name).expanduser(), configuration.results.gnss_offset_s)
+
+
+def fixes_of_file(path: Path, offset_s: float | None = None) -> Fixes:
+    """Reads a file of fixes; `offset_s` as in `read_track`. Raises GnssError."""
     try:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
     except OSError as error:
         raise GnssError(f"{path}: can't be read: {error.strerror}") from None
-    offset_s = configuration.results.gnss_offset_s
     read_track(data, str(path), 0, offset_s)  # raises errors before the drive
     return lambda begin_ns: read_track(data, str(path), begin_ns, offset_s)
 

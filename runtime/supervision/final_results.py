@@ -17,12 +17,15 @@ import msgspec
 
 from birdslam.geometry.arrays import Floats, Image
 from birdslam.geometry.camera import Camera, Undistorter
+from birdslam.loops.gnss.earth import EarthError
+from birdslam.loops.gnss.files import GnssError
 from birdslam.outputs.drive_files import ResultsError, claim_directory
 from birdslam.outputs.drive_video import CODEC, DriveVideo, check_video
 from birdslam.outputs.final_trajectories import FinalTracks, last_seen, write_final_ego
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.maps.drive_earth import rows as earth_rows
 from birdslam.runtime.maps.drive_map import DriveMap, check_map_choice
+from birdslam.runtime.maps.gnss_input import fixes_of_file
 from birdslam.runtime.maps.map_drive import rows as map_rows
 from birdslam.runtime.nodes.sources import Source, open_source
 from birdslam.runtime.progress import Progress
@@ -35,6 +38,7 @@ from birdslam.types import Estimate, MapUpdate, Measurements
 
 DEMO_VIDEO = "drive.mp4"  # of the shipped drive, always written
 TEMPORARY = "drive.mcap"
+GNSS_UNUSED = "gnss_unused"  # of summary.json: why a track found inside a film does not place the drive on Earth
 
 Frames = Iterator[tuple[int, int, Image | None]]  # frame_id, source time in ns, undistorted image
 Records = Iterable[Measurements | Estimate | MapUpdate]
@@ -59,11 +63,15 @@ def check_results(configuration: Configuration, source: Source) -> None:
 class FinalResults:
     """The final results of one run."""
 
-    def __init__(self, configuration: Configuration, demo: DemoReport | None) -> None:
+    def __init__(self, configuration: Configuration, demo: DemoReport | None, film_track: Path | None = None) -> None:
+        """`film_track`: GNSS fixes found inside a film, used where no map and no other fixes are requested."""
         self._config, self._demo = configuration, demo
         self._asked_video = bool(configuration.results.video)
         self._video: Path | None = None
         self.map = DriveMap.of(configuration)
+        self._is_gnss_found = film_track is not None and self.map is None and not configuration.maps_live
+        if film_track is not None and self._is_gnss_found:
+            self.map = DriveMap(None, fixes_of_file(film_track, configuration.results.gnss_offset_s))
         if self._asked_video:
             self._video = Path(configuration.results.video)
         elif demo is not None:
@@ -83,7 +91,7 @@ class FinalResults:
     def write(self, files: Sequence[Path]) -> dict[str, Any]:
         """Writes the requested results from the recording in `files`; returns their entries of summary.json.
 
-        Raises ResultsError, DatasetError, RecordingError or OSError.
+        Raises ResultsError, DatasetError, RecordingError or OSError; of a requested map or GNSS, its errors.
         """
         summary: dict[str, Any] = {}
         if self._config.results.smooth:
@@ -101,7 +109,12 @@ class FinalResults:
             summary |= self.map.finish(self._config.camera, iter(()), Path(self._config.output))
         elif self.map is not None:
             source = open_source(self._config)
-            summary |= self.map.finish(source.camera, source_frames(source), Path(self._config.output))
+            try:
+                summary |= self.map.finish(source.camera, source_frames(source), Path(self._config.output))
+            except (EarthError, GnssError) as error:
+                if not self._is_gnss_found:
+                    raise
+                summary[GNSS_UNUSED] = str(error)
         return summary
 
     def _draw(self, path: Path, files: Sequence[Path]) -> None:

@@ -33,7 +33,7 @@ from birdslam.runtime.process.child import give_back_memory
 from birdslam.runtime.recording.recording import RecordingError
 from birdslam.runtime.supervision.demo_report import DemoReport
 from birdslam.runtime.supervision.drive_report import can_report, write_report
-from birdslam.runtime.supervision.final_results import FinalResults, check_results
+from birdslam.runtime.supervision.final_results import GNSS_UNUSED, FinalResults, check_results
 from birdslam.runtime.supervision.live import LiveLine
 from birdslam.runtime.supervision.logbook import Logbook, Results
 from birdslam.runtime.supervision.map_station import map_summary
@@ -52,10 +52,11 @@ USER_ERRORS = MapError, GnssError, EarthError, ConfigurationError  # of a map or
 DRIVE_MIB = 32.0, 8.0  # reserved for objects (the atlas has up to two epochs of 13 MiB) and for tables
 
 
-def run(configuration: Configuration, lengths_by: LengthsBy | None = None) -> int:
+def run(configuration: Configuration, lengths_by: LengthsBy | None = None, film_track: Path | None = None) -> int:
     """Runs a drive; returns the exit status. Raises errors of the user before anything is started.
 
-    `lengths_by`: the source of the metric scale, for the verdict at the end, if a first pass calibrated the camera. At
+    `lengths_by`: the source of the metric scale, for the verdict at the end, if a first pass calibrated the camera.
+    `film_track`: GNSS fixes found inside the film. At
     rate "max", without a vehicle name or a runtime directory, the run has a private bus.
     """
     alone = configuration.lossless and configuration.vehicle == ANY_VEHICLE and configuration.runtime_dir is None
@@ -63,10 +64,10 @@ def run(configuration: Configuration, lengths_by: LengthsBy | None = None) -> in
         if directory is not None:
             runtime = msgspec.structs.replace(configuration.runtime, runtime_dir=str(directory))
             configuration = msgspec.structs.replace(configuration, runtime=runtime)
-        return _run(configuration, lengths_by)
+        return _run(configuration, lengths_by, film_track)
 
 
-def _run(configuration: Configuration, lengths_by: LengthsBy | None) -> int:
+def _run(configuration: Configuration, lengths_by: LengthsBy | None, film_track: Path | None) -> int:
     realtime.use_one_heap()  # before the networks are loaded, which starts threads
     configuration, models, frames = check(configuration)
     give_back_memory()  # of the networks
@@ -74,7 +75,7 @@ def _run(configuration: Configuration, lengths_by: LengthsBy | None) -> int:
     realtime.reserve(*DRIVE_MIB)
     live = LiveLine(sys.stdout)
     demo = DemoReport.of(configuration)
-    final = FinalResults(configuration, demo)
+    final = FinalResults(configuration, demo, film_track)
     with ExitStack() as until_written:
         with ExitStack() as stack:
             stack.enter_context(VehicleLock(configuration.vehicle, configuration.runtime_dir))
@@ -104,6 +105,8 @@ def _run(configuration: Configuration, lengths_by: LengthsBy | None) -> int:
         try:
             if logbook.recorded:
                 summary |= final.write(files.paths if files is not None else ())
+            if GNSS_UNUSED in summary:
+                live.say(f"the GNSS track inside the film is not used: {summary[GNSS_UNUSED]}")
         except (ResultsError, DatasetError, RecordingError, *USER_ERRORS, OSError) as error:
             supervisor.fail(f"final results can't be written: {error}", 1)
         except KeyboardInterrupt:

@@ -22,7 +22,7 @@ from birdslam.runtime.cli.arguments import (
     add_topics,
 )
 from birdslam.runtime.cli.commands import sources_note
-from birdslam.runtime.configuration import Configuration, ConfigurationError
+from birdslam.runtime.configuration import FILM, Configuration, ConfigurationError
 from birdslam.runtime.maps import film_gnss
 from birdslam.runtime.models.download import DownloadError
 from birdslam.runtime.models.recommended import fetch, recommended
@@ -70,12 +70,12 @@ def run(options: argparse.Namespace) -> int:
     if scheme is VIDEO and not options.model and not configuration.models.given() and configuration.models.shipped:
         options.model = list(_networks(configuration, options.yes))
         configuration = configuration_of(options)
-    configuration = _with_film_gnss(configuration)
+    configuration, film_track = _with_film_gnss(configuration)
     stated = (options.height, lens, options.known_length)
     if all(each is None for each in stated) and (scheme is not VIDEO or configuration.camera is not None):
-        return run_processes(configuration)
+        return run_processes(configuration, None, film_track)
     configuration, lengths_by = _calibrated(configuration, options, lens)
-    return run_processes(configuration, lengths_by)
+    return run_processes(configuration, lengths_by, film_track)
 
 
 def _lens_of_another_project(options: argparse.Namespace) -> Path | None:
@@ -89,38 +89,37 @@ def _lens_of_another_project(options: argparse.Namespace) -> Path | None:
     return path
 
 
-def _with_film_gnss(configuration: Configuration) -> Configuration:
-    """Returns the configuration with the GNSS track inside a film, where it is named or no other is.
+def _with_film_gnss(configuration: Configuration) -> tuple[Configuration, Path | None]:
+    """Returns the configuration with the GNSS track inside a film where `film` is named; else that track, if any.
 
     Raises ConfigurationError, DatasetError, GnssError.
     """
     source, results = configuration.source, configuration.results
-    named = film_gnss.FILM in (source.speed, results.gnss)
+    is_named = FILM in (source.speed, results.gnss)
     scheme, _, address = source.uri.partition(":")
-    if scheme != VIDEO.name:
-        if named:
-            raise ConfigurationError(f"--gnss film, --speed film: the source is no film: {source.uri}")
-        return configuration
-    if not named and (results.gnss or not film_gnss.is_readable()):
-        return configuration
+    if scheme != VIDEO.name and is_named:
+        raise ConfigurationError(f"--gnss film, --speed film: the source is no film: {source.uri}")
+    if scheme != VIDEO.name or not (is_named or (not results.gnss and film_gnss.is_readable())):
+        return configuration, None
     track = Path(configuration.output) / film_gnss.TRACK_FILE
-    films = films_in(Path(address).expanduser(), VIDEO.suffixes)
     try:
-        count = film_gnss.track_of_films(films, track)
-    except GnssError:
-        if named:
+        count = film_gnss.track_of_films(films_in(Path(address).expanduser(), VIDEO.suffixes), track)
+    except GnssError as error:
+        if is_named:
             raise
-        return configuration  # a film that can't be read is reported when it is opened
+        print(f"birdslam: {error}", file=sys.stderr)
+        return configuration, None
+    if not count and is_named:
+        raise ConfigurationError(f"--gnss film, --speed film: {address}: has no GNSS track")
     if not count:
-        if named:
-            raise ConfigurationError(f"--gnss film, --speed film: {address}: has no GNSS track")
-        return configuration
+        return configuration, None
     print(f"{count} GNSS fixes inside the film: {track}", flush=True)
-    if source.speed == film_gnss.FILM:
+    if source.speed == FILM:
         source = msgspec.structs.replace(source, speed=str(track))
-    if results.gnss in ("", film_gnss.FILM):
+    if results.gnss == FILM:
         results = msgspec.structs.replace(results, gnss=str(track))
-    return msgspec.structs.replace(configuration, source=source, results=results)
+    configuration = msgspec.structs.replace(configuration, source=source, results=results)
+    return configuration, None if results.gnss else track
 
 
 def _networks(configuration: Configuration, fetch_them: bool) -> tuple[str, ...]:
