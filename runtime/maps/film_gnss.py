@@ -62,8 +62,7 @@ def read_film(path: Path) -> list[FilmFix]:
     except subprocess.TimeoutExpired:
         raise GnssError(f"{path}: ExifTool did not finish in {_LIMIT_S:g} s") from None
     except (msgspec.MsgspecError, ValueError):
-        said = done.stderr.decode(errors="replace").strip().splitlines()
-        raise GnssError(f"{path}: ExifTool can't read it: {said[0] if said else 'no output'}") from None
+        return []  # a file that is no film is reported when it is opened
     samples: dict[str, dict[str, Any]] = {}
     for name, value in tags.items():
         group, _, tag = name.partition(":")
