@@ -348,7 +348,8 @@ def test_kills_and_restarts_cost_no_bit_and_a_kill_of_everything_leaves_a_file_t
     assert not recording.complete
     assert verdict.restarts == 1
     assert verdict.unknown == 0
-    assert heard <= set(estimated(recording))
+    # SIGKILL can fall between the sends to the planner and to the recorder: the last estimate before it may be missing
+    assert heard - set(estimated(recording)) <= {min(heard)}
     images = [msgspec.json.decode(m.data, type=CompressedImage) for m in recording.messages(("/camera/image",))]
     assert len(images) > 50
     assert cv2.imdecode(np.frombuffer(images[-1].data, np.uint8), cv2.IMREAD_UNCHANGED).shape == (HEIGHT, WIDTH)
