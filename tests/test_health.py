@@ -395,38 +395,75 @@ def test_a_full_disk_costs_lines_not_the_drive() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), full.fileno())  # what is buffered goes there when it is closed
 
 
-def test_a_logbook_survives_a_disk_failure(tmp_path: Path) -> None:
-    class Full:
-        def add(self, estimate: Estimate) -> None:
-            raise OSError(28, "No space left on device")
+class Full:
+    """Results on a full disk."""
 
-        def add_map(self, map_update: MapUpdate) -> None:
-            raise AssertionError("not after the disk has failed")
+    def add(self, estimate: Estimate) -> None:
+        raise OSError(28, "No space left on device")
 
+    def add_map(self, map_update: MapUpdate) -> None:
+        raise AssertionError("not after the disk has failed")
+
+
+class Stalled:
+    """Results on a disk that writes nothing before `released`."""
+
+    def __init__(self) -> None:
+        self.released = threading.Event()
+        self.frames: list[int] = []
+
+    def add(self, estimate: Estimate) -> None:
+        assert self.released.wait(60.0)
+        self.frames.append(estimate.frame_id)
+
+    def add_map(self, map_update: MapUpdate) -> None:
+        """Keeps nothing."""
+
+
+def send_drive(logbook: Logbook, bus: Bus, frames: int) -> None:
+    """Sends the map, the estimates of `frames` frames and END_OF_SOURCE."""
     stamps = {"t_source_ns": 0, "t_capture_ns": 0, "t_utc_ns": 0}
+    out, gained = bus.publisher("estimate"), bus.publisher("map")
+    assert out.wait_matched(60.0)
+    assert gained.wait_matched(60.0)
+    gained.put(MapUpdate(epoch=0, frame_id=frames), Trace((Stage("optimize", 1, 2),)))
+    for number in range(frames + 1):
+        status = (Status.END_OF_SOURCE,) if number == frames else ()
+        estimate = Estimate(
+            epoch=0, frame_id=number, T_world_ego=SE2(), cov=(0.0,) * 9, valid=not status, status=status, **stamps
+        )
+        out.put(estimate, Trace((Stage("optimize", 1, 2),)))
+
+
+def test_a_logbook_survives_a_disk_failure(tmp_path: Path) -> None:
     with Bus("disk", "supervisor", hub=True, runtime_dir=tmp_path) as hub:
         logbook = Logbook(hub, Full(), tolerant=True)
         with Bus("disk", "optimize", runtime_dir=tmp_path) as bus:
-            out, gained = bus.publisher("estimate"), bus.publisher("map")
-            assert out.wait_matched(60.0)
-            assert gained.wait_matched(60.0)
-            gained.put(MapUpdate(epoch=0, frame_id=0), Trace((Stage("optimize", 1, 2),)))
-            for number in range(3):
-                status = (Status.END_OF_SOURCE,) if number == 2 else ()
-                estimate = Estimate(
-                    epoch=0,
-                    frame_id=number,
-                    T_world_ego=SE2(),
-                    cov=(0.0,) * 9,
-                    valid=not status,
-                    status=status,
-                    **stamps,
-                )
-                out.put(estimate, Trace((Stage("optimize", 1, 2),)))
-            logbook.wait_over(60.0)
+            send_drive(logbook, bus, frames=2)
+            logbook.wait_over(60.0, 60.0)
         assert logbook.ended
         assert (logbook.recorded, logbook.error) == (2, None)
         assert isinstance(logbook.unwritten, OSError)
+        logbook.close()
+
+
+def test_a_logbook_writes_what_has_arrived_before_a_slow_disk_ends_the_run(tmp_path: Path) -> None:
+    with Bus("slow", "supervisor", hub=True, runtime_dir=tmp_path) as hub:
+        results = Stalled()
+        logbook = Logbook(hub, results)
+        with Bus("slow", "optimize", runtime_dir=tmp_path) as bus:
+            send_drive(logbook, bus, frames=4)
+            until_s = time.monotonic() + 60.0
+            while logbook.unread < 4:
+                assert time.monotonic() < until_s
+            logbook.wait_over(idle_s=0.01, stalled_s=0.01)
+            assert not logbook.ended  # it gives up on a disk that does not write
+            timer = threading.Timer(1.5, results.released.set)
+            timer.start()
+            logbook.wait_over(idle_s=1.0, stalled_s=60.0)
+            timer.join()
+        assert logbook.ended
+        assert results.frames == [0, 1, 2, 3]
         logbook.close()
 
 

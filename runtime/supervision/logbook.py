@@ -57,6 +57,7 @@ class Logbook:
         self._recent: deque[tuple[int, float]] = deque(maxlen=RECENT_FRAMES)  # received (ns), age (ms)
         self._latest: Estimate | None = None
         self._map_frame = -1  # of the newest map update
+        self._begun = self._done = 0  # estimates whose processing has begun, and has ended
         self._thread = threading.Thread(target=self._run, name="logbook", daemon=True)
         self._thread.start()
 
@@ -65,7 +66,9 @@ class Logbook:
             while not self.ended:
                 message = self._estimates.recv()
                 if message is not None:
+                    self._begun += 1
                     self._take(message)
+                    self._done += 1
         except BusClosed:
             return
         except Exception as error:  # reported by the supervisor
@@ -154,9 +157,21 @@ class Logbook:
             "speed_sources": dict(sorted(self.speed_sources.items())),
         }
 
-    def wait_over(self, timeout_s: float) -> None:
-        """Waits until the end was received, or recording failed."""
-        self._thread.join(timeout_s)
+    @property
+    def unread(self) -> int:
+        """The number of estimates that have arrived and wait to be written."""
+        return self._estimates.unread
+
+    def wait_over(self, idle_s: float, stalled_s: float) -> None:
+        """Waits until the end was processed, or recording failed.
+
+        At most `idle_s` for the next estimate to arrive, and `stalled_s` for one to be written.
+        """
+        while self._thread.is_alive():
+            before = self._begun, self._done
+            self._thread.join(stalled_s if self.unread or self._begun > self._done else idle_s)
+            if before == (self._begun, self._done):
+                return
 
     def close(self) -> None:
         """Closes the bus, which ends the thread."""

@@ -62,6 +62,7 @@ class Supervisor:
 
     def run(self, logs: Path) -> None:
         """Starts all nodes; returns when all have ended."""
+        runtime = self._config.runtime
         with _signals() as signals, self._selector, ExitStack() as stack:
             self._selector.register(signals, selectors.EVENT_READ, self._signal)
             self._selector.register(self._logbook.event_fd, selectors.EVENT_READ, self._logbook_event)
@@ -80,8 +81,8 @@ class Supervisor:
                 self._watch()
                 self._show()
             if not self.failure and self.nodes["capture"].process.ready:
-                self._logbook.wait_over(self._config.runtime.drain_timeout_s)
-            self._end_beside(self._config.runtime.stop_timeout_s)
+                self._logbook.wait_over(runtime.drain_timeout_s, runtime.stop_timeout_s)
+            self._end_beside(runtime.stop_timeout_s)
             self._show()
             self._notifier.once("STOPPING=1")
         if not self.failure and not self._logbook.ended and self._stopped_by is None:

@@ -199,6 +199,11 @@ class Subscriber:
         if reply.ok is not None and self.newest is None:
             self._receive(reply.ok)
 
+    @property
+    def unread(self) -> int:
+        """The number of messages in the queue."""
+        return len(self._queue)
+
     def recv(self, timeout_s: float | None = None) -> Message | None:
         """Waits for the next message; returns None if none arrives within `timeout_s` (None: no limit).
 
