@@ -57,7 +57,7 @@ class Logbook:
         self._recent: deque[tuple[int, float]] = deque(maxlen=RECENT_FRAMES)  # received (ns), age (ms)
         self._latest: Estimate | None = None
         self._map_frame = -1  # of the newest map update
-        self._begun = self._done = 0  # estimates whose processing has begun, and has ended
+        self._started = self._done = 0  # estimates whose processing has started, and has ended
         self._thread = threading.Thread(target=self._run, name="logbook", daemon=True)
         self._thread.start()
 
@@ -66,7 +66,7 @@ class Logbook:
             while not self.ended:
                 message = self._estimates.recv()
                 if message is not None:
-                    self._begun += 1
+                    self._started += 1
                     self._take(message)
                     self._done += 1
         except BusClosed:
@@ -168,9 +168,9 @@ class Logbook:
         At most `idle_s` for the next estimate to arrive, and `stalled_s` for one to be written.
         """
         while self._thread.is_alive():
-            before = self._begun, self._done
-            self._thread.join(stalled_s if self.unread or self._begun > self._done else idle_s)
-            if before == (self._begun, self._done):
+            before = self._started, self._done
+            self._thread.join(stalled_s if self.unread or self._started > self._done else idle_s)
+            if before == (self._started, self._done):
                 return
 
     def close(self) -> None:
