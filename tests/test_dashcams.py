@@ -82,6 +82,7 @@ def undistorted(name: str) -> list[np.ndarray]:
     return [undistort(image) for image in images_of(name)]
 
 
+@pytest.mark.slow
 def test_distances_of_dashcams_with_a_known_lens_are_within_their_sigma() -> None:
     """Of 16 starts, four of each film: median error 0.7 %, the worst at 0.8 sigma, 89 % valid and more.
 

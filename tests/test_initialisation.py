@@ -190,6 +190,7 @@ def _starts(data_dir: Path, sequence: str, every: int, mirrored: bool) -> tuple[
     return rows, motions
 
 
+@pytest.mark.slow
 def test_cold_starts_on_real_roads_have_the_right_scale(data_dir: Path) -> None:
     """Streets and a ramp of 21 m radius, as they are and mirrored; about 25 starts.
 

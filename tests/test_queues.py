@@ -23,6 +23,7 @@ CLIP = Path(__file__).parent / "roads" / "queue_avenue"
 STARTS = range(15)
 
 
+@pytest.mark.slow
 def test_valid_speeds_in_a_queue_are_within_their_sigmas() -> None:
     """Of 480 motions of 15 starts, over processors and perturbed tracks: 89 % valid, 94 to 95 % inside 2 sigma."""
     drive = read(DemoRecording(directory=CLIP))

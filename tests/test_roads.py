@@ -63,6 +63,7 @@ def test_cold_starts_on_roads_have_the_right_scale() -> None:
     check_starts([measure(read(DemoRecording(directory=CLIPS / name)), (0, 2, 4)) for name in NAMES], 0.01)
 
 
+@pytest.mark.slow
 def test_cold_starts_behind_a_windscreen_have_the_right_scale() -> None:
     """Of 16 starts: median error 0.8 %, 90 % valid, no motion of 372 wrong while valid."""
     drives = [("motorway_40", effect) for effect in ON_THE_GLASS]
@@ -81,6 +82,7 @@ def test_cold_starts_on_a_street_behind_a_windscreen_have_the_right_scale() -> N
     )
 
 
+@pytest.mark.slow
 def test_cold_starts_on_coarsely_encoded_motorways_have_the_right_scale() -> None:
     """Of 16 starts: median error 1.4 to 1.8 %, 1 of 344 motions wrong while valid."""
     rows = [measure(read(DemoRecording(directory=CLIPS / f"{name}_compressed")), range(8)) for name in NAMES[:2]]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -87,6 +88,38 @@ class Gated(Head):
         self.go.wait(60.0)
         self.done.set()
         return super().answer(image)
+
+
+def test_networks_run_on_the_next_frame_while_the_caller_processes_one() -> None:
+    def frame(k: int) -> Frame:
+        return Frame(k, k, k, k, None if k == 3 else IMAGE)
+
+    def carried(perception: Perception) -> tuple[dict[str, int], tuple[Status, ...]]:
+        return perception.ages, perception.status
+
+    with ThreadPoolExecutor(1) as threads:
+        alone, ahead = (Networks([Head("detector", every=2)], threads.submit) for _ in range(2))
+        expected = [carried(alone.start(k, frame(k).image).result()) for k in range(8)]
+        found, started, read = [], [], []
+
+        def frames() -> Iterator[Frame]:
+            for k in range(8):
+                read.append(k)
+                yield frame(k)
+
+        for each, pending in ahead.in_order(frames()):
+            found.append(carried(pending.result()))
+            started.append((each.frame_id, read[-1]))
+        assert found == expected
+        assert started == [(k, min(k + 1, 7)) for k in range(8)]
+
+
+def test_frames_whose_perception_is_not_taken_are_yielded_too() -> None:
+    with ThreadPoolExecutor(1) as threads:
+        networks = Networks([Head("detector")], threads.submit)
+        frames = [Frame(k, k, k, k, IMAGE) for k in range(3)]
+        assert [frame.frame_id for frame, _ in networks.in_order(frames)] == [0, 1, 2]
+        assert list(networks.in_order([])) == []
 
 
 def test_of_frames_before_the_one_that_is_looked_at_no_more_detections_come() -> None:

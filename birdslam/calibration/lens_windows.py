@@ -35,6 +35,8 @@ FOCAL_PX = 720.0
 _MAX_TURN_RAD = 0.8  # of a window
 _MAX_DISTANCE = 80.0  # of a corner with initial values, in baselines of its window
 _MAX_ANGLE_RAD = 1.45  # max. angle of a corner from the axis
+_MAX_GAP_S = 1.0
+_STARTS = 100  # windows tried where the car moves too little up to the end of the drive: else the search is quadratic
 
 
 @dataclass(frozen=True)
@@ -49,12 +51,15 @@ class CornersOfImage:
 def track_corners(images: Iterable[tuple[NDArray[np.uint8], Floats, float]], camera: Camera) -> list[CornersOfImage]:
     """Tracks corners through raw images, given with the boxes (B, 4) of vehicles and the time in s.
 
-    Corners in boxes are left out. `camera` needs the image size and an approximate focal length only.
+    Corners in boxes are left out; no corner continues after a gap in time. `camera` needs the image size and an
+    approximate focal length only.
     """
     out: list[CornersOfImage] = []
     resolution = WorkingResolution(camera)
     tracker = FeatureTracker(resolution.camera.width_px, resolution.camera.height_px, FeatureConfig())
     for image, boxes_px, t_s in images:
+        if out and not 0.0 <= t_s - out[-1].t_s <= _MAX_GAP_S:
+            tracker.drop_reference()
         tracks = tracker.track(resolution.image(image))
         tracker.accept(tracks)
         static = outside(tracks.px, resolution.boxes_px(boxes_px))
@@ -100,10 +105,13 @@ def _select_apart(
             moved = _flow_px(images[at[-1]], images[k])
             if len(moved) < _MIN_CORNERS:
                 break
-            if np.quantile(moved, 1.0 - share) > step_px:
+            if _share_moved(moved, step_px, share):
                 at.append(k)
             if len(at) == IMAGES:
                 break
+        else:
+            first += 1 + (len(images) - first) // _STARTS
+            continue
         if len(at) < IMAGES:
             first += 1
             continue
@@ -117,9 +125,17 @@ def _select_apart(
 
 def _flow_px(a: CornersOfImage, b: CornersOfImage) -> Floats:
     """(N,) displacement of the corners common to both images."""
-    _, in_a, in_b = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
-    out: Floats = np.linalg.norm(b.px[in_b] - a.px[in_a], axis=1)
+    in_b = np.searchsorted(b.ids, a.ids)
+    in_b[in_b == len(b.ids)] = 0
+    common = b.ids[in_b] == a.ids if len(b.ids) else np.zeros(len(a.ids), bool)
+    out: Floats = np.linalg.norm(b.px[in_b[common]] - a.px[common], axis=1)
     return out
+
+
+def _share_moved(moved_px: Floats, step_px: float, share: float) -> bool:
+    """Whether this share of the corners moved by more than a step. The count decides most cases without sorting."""
+    above = int(np.count_nonzero(moved_px > step_px))
+    return above >= math.floor(share * (len(moved_px) - 1)) and bool(np.quantile(moved_px, 1.0 - share) > step_px)
 
 
 def _common_corners(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, wait
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
@@ -15,7 +16,7 @@ from birdslam.perception.decoding.detection import Detections, with_bodies
 from birdslam.perception.decoding.multitask import Findings
 from birdslam.perception.decoding.segmentation import Segmentation
 from birdslam.perception.manifest import Role, Schedule
-from birdslam.types import Status
+from birdslam.types import Frame, Status
 
 CARRIED: dict[Role, Status] = {
     "detector": Status.DETECTIONS_CARRIED,
@@ -81,6 +82,19 @@ class WithDetections:
             return replace(found, ages=perception.ages | {"detector": 0})
         ages = {name: age for name, age in perception.ages.items() if name != "depth"}
         return replace(found, depth=None, ages=ages | {"detector": 0})
+
+
+@dataclass(frozen=True)
+class Followed:
+    """A pending perception; calls `then` as soon as its result is taken."""
+
+    pending: Pending
+    then: Callable[[], None]
+
+    def result(self) -> Perception:
+        perception = self.pending.result()
+        self.then()
+        return perception
 
 
 class Head(Protocol):
@@ -213,6 +227,26 @@ class Networks:
         if detections is None:
             return pending
         return WithDetections(pending, detections, frame_id, depth=any(head.role == "depth" for head in self.heads))
+
+    def in_order(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, Pending]]:
+        """Yields each frame with its perception, and starts the next frame as soon as the result of one is taken.
+
+        The networks then run while the caller processes the frame before. With `patience_s` None the results are those
+        of `start` on each frame.
+        """
+        remaining = iter(frames)
+        started: deque[tuple[Frame, Pending]] = deque()
+
+        def start_next() -> None:
+            frame = next(remaining, None) if not started else None
+            if frame is not None:
+                started.append((frame, self.start(frame.frame_id, frame.image)))
+
+        start_next()
+        while started:
+            frame, pending = started.popleft()
+            yield frame, Followed(pending, start_next)
+            start_next()  # for a frame whose result was not taken
 
     def _begin(self, slot: _Slot, frame_id: int) -> Callable[[NDArray[np.uint8]], Findings | None]:
         """What is to run for a slot."""

@@ -36,8 +36,10 @@ def pipeline(configuration: Configuration) -> Iterator[Drive]:
                 lane_head=inference.lane_head,
                 odometry=external_odometry(configuration, recording.camera, recording.name),
             )
-            for frame in offline_frames(source):
-                yield from slam.step(frame)
+            for frame, pending in inference.networks.in_order(offline_frames(source)):
+                measurements = slam.frontend.measure(frame, pending)
+                yield measurements
+                yield slam.graph.optimise(measurements)
                 gained = slam.map_update()
                 if gained is not None:
                     yield gained

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import islice
 from typing import NamedTuple
 
 import cv2
@@ -29,18 +28,17 @@ from birdslam.runtime.calibration.height import (
     with_height,
 )
 from birdslam.runtime.calibration.lens import corners_of_drive, lens_of_drive
+from birdslam.runtime.calibration.pieces import pieces, read_pieces
 from birdslam.runtime.calibration.report import report
 from birdslam.runtime.configuration import Configuration
 from birdslam.runtime.nodes.inference import Inference
-from birdslam.runtime.nodes.sources import RecordedSource, offline_frames, open_recorded, parsed, recording_uri
-from birdslam.runtime.progress import with_progress
+from birdslam.runtime.nodes.sources import open_recorded, parsed, recording_uri
 from birdslam.sources.recording import DatasetError, Recording
 from birdslam.types import Frame
 
 # For a first pass: the run that follows estimates the tilt again
 ROUGH = CalibrationConfig(max_sigma_rad=0.05, max_sigma_roll_rad=0.1)
 LEVEL_SIGMA_RAD = 0.035  # prior of pitch and roll: two degrees, by judgement
-_MOUNT_S = 180.0  # part of a video used for pitch, roll and height
 
 
 class Calibrated(NamedTuple):
@@ -92,10 +90,8 @@ def calibrate_drive(
     with Inference(configuration) as inference:
 
         def drive() -> Iterator[tuple[Frame, Pending]]:
-            most = round(_MOUNT_S * recording.rate_hz)
-            frames = islice(offline_frames(RecordedSource(recording, configuration.source)), most)
-            for frame in with_progress(frames, "calibrate", min(most, len(recording)) or None):
-                yield frame, inference.start(frame)
+            frames = read_pieces(recording, pieces(recording, configuration.source.frames), "calibrate")
+            return inference.networks.in_order(frames)
 
         try:
             found = calibrate(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import islice
 from typing import NamedTuple
 
 import msgspec
@@ -21,13 +20,11 @@ from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.runtime.calibration.given import FocalLength, Given, focal_length_of
 from birdslam.runtime.calibration.height import UNKNOWN_HEIGHT_M
+from birdslam.runtime.calibration.pieces import READ_S, pieces, read_pieces
 from birdslam.runtime.configuration import Configuration, complete
 from birdslam.runtime.nodes.inference import Inference
-from birdslam.runtime.nodes.sources import RecordedSource, offline_frames, open_recorded
-from birdslam.runtime.progress import with_progress
+from birdslam.runtime.nodes.sources import open_recorded
 from birdslam.types import NS_PER_S
-
-_LENS_S = 120.0  # part of a video used for its lens
 
 
 class LensOfDrive(NamedTuple):
@@ -79,8 +76,8 @@ def lens_of_drive(
         return LensOfDrive(assumed, corners, SIGMA_K1)
     if lens is None:
         raise CalibrationError(
-            f"{uri}: its images do not determine the lens: the car hardly moves in the first {_LENS_S:g} s, or the "
-            "images have too little texture; name a lens with --intrinsics, --chessboard or --camera"
+            f"{uri}: its images do not determine the lens: the car hardly moves in the {READ_S:g} s that are read, or "
+            "the images have too little texture; name a lens with --intrinsics, --chessboard or --camera"
         )
     focal = f"focal length {lens.focal_px:.0f} px +- {lens.focal_sigma_rel:.0%}"
     lines = f", {uprights.edges} vertical edges" if bend is not None and uprights is not None else ""
@@ -110,17 +107,17 @@ def corners_of_drive(
     configuration = configuration.as_lossless()
     raw = msgspec.structs.replace(camera, distortion=(), fisheye=False)
     recording = open_recorded(uri, raw, stride, configuration.source.topics)
-    frames = max(1, round(_LENS_S * recording.rate_hz))
-    every = max(1, min(frames, len(recording) or frames) // MAX_IMAGES)
+    read = pieces(recording, configuration.source.frames)
+    every = max(1, sum(map(len, read)) // MAX_IMAGES)
     with Inference(complete(configuration, raw, recording.rate_hz)) as inference:
 
         def images() -> Iterator[tuple[NDArray[np.uint8], Floats, float]]:
-            seen = islice(offline_frames(RecordedSource(recording, configuration.source)), frames)
-            for index, frame in enumerate(with_progress(seen, "lens", min(frames, len(recording)) or None)):
+            frames = read_pieces(recording, read, "lens")
+            for index, (frame, pending) in enumerate(inference.networks.in_order(frames)):
                 if frame.image is not None:
                     if edges is not None and index % every == 0:
                         edges.append(find_vertical_edges(frame.image))
-                    found = inference.start(frame).result().detections
+                    found = pending.result().detections
                     boxes_px = np.zeros((0, 4)) if found is None else found.boxes_px
                     yield frame.image, boxes_px, frame.t_source_ns / NS_PER_S
 

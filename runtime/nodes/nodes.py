@@ -15,9 +15,10 @@ from typing import Any, Protocol
 import cv2
 import msgspec
 
-from birdslam.frontend import FrontEnd
+from birdslam.frontend import FrontEnd, Pending
 from birdslam.geometry.camera import Camera
 from birdslam.graph.minimum import solver
+from birdslam.perception.schedule import Followed
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.nodes.capture import CaptureNode, stamps
 from birdslam.runtime.nodes.degradation import STATUS, Degradation, Mode
@@ -75,6 +76,8 @@ class PerceiveNode:
         degrades = configuration.degradation.enabled and not configuration.lossless
         self._frames = bus.subscriber("frame", WAITING_FRAMES if degrades else None)
         self._waiting: deque[Message] = deque()  # received frames after the current one
+        self._is_lossless = configuration.lossless
+        self._started: tuple[Frame, Pending] | None = None  # at rate "max": the next frame
         self._ring = FrameReader(ring_path(configuration.vehicle, configuration.runtime_dir))
         self._inference = inference
         self._frontend = frontend
@@ -101,7 +104,9 @@ class PerceiveNode:
         return Mode.FULL if self._degradation is None else self._degradation.mode
 
     def receive(self, timeout_s: float) -> Message | None:
-        """Returns the next frame; `_waiting` holds the frames after it."""
+        """Returns the next frame; `_waiting` holds the frames after it, at rate "max" none."""
+        if self._degradation is None and self._waiting:
+            return self._waiting.popleft()
         message = self._frames.recv(0.0 if self._waiting else timeout_s)
         while message is not None:
             self._waiting.append(message)
@@ -122,15 +127,13 @@ class PerceiveNode:
         if self._overtaken:
             yield self._coast(ref)
             return
-        image = None
-        if ref.slot >= 0:
-            image = self._ring.read(ref)
-            if image is None:  # overwritten meanwhile: the next frame gets FRAMES_DROPPED
-                self._torn += 1
-                return
-        frame = Frame(**stamps(ref), image=image, status=ref.status, speeds=ref.speeds)
+        frame, pending = self._started or (self._read(ref), None)
+        self._started = None
+        if frame is None:
+            return
         if self._degradation is None:
-            yield self._frontend.measure(frame, self._inference.start(frame))
+            pending = pending or self._inference.start(frame)
+            yield self._frontend.measure(frame, Followed(pending, self._start_next) if self._is_lossless else pending)
         else:
             mode = self._degradation.mode
             yield self._coast(ref) if self._coasts(ref, mode) else self._look(frame, mode)
@@ -139,6 +142,26 @@ class PerceiveNode:
         self._adapt_rate(ref.frame_id, (now_ns - start_ns) / 1e6)
         if self._degradation is not None and self._degradation.judge((now_ns - ref.t_capture_ns) / 1e6):
             log.warning("frame %d: mode %s after %s", ref.frame_id, self._degradation.mode, mode)
+
+    def _read(self, ref: FrameRef) -> Frame | None:
+        """Reads a frame from the ring; None if it was overwritten meanwhile: the next frame gets FRAMES_DROPPED."""
+        image = None
+        if ref.slot >= 0:
+            image = self._ring.read(ref)
+            if image is None:
+                self._torn += 1
+                return None
+        return Frame(**stamps(ref), image=image, status=ref.status, speeds=ref.speeds)
+
+    def _start_next(self) -> None:
+        """Starts the networks on the next frame, if it has arrived, while the front end processes this one."""
+        message = self._frames.recv(0.0)
+        if message is None:
+            return
+        self._waiting.append(message)
+        frame = None if Status.END_OF_SOURCE in message.record.status else self._read(message.record)
+        if frame is not None:
+            self._started = frame, self._inference.start(frame)
 
     def _adapt_rate(self, frame_id: int, step_ms: float) -> None:
         """Reduces the rate of the networks after dropped frames, and raises it when there is time."""
