@@ -65,7 +65,7 @@ def received(subscriber: Subscriber, timeout_s: float = LIMIT_S) -> Any:
 
 
 def until(condition: Any, what: str) -> None:
-    end_s = time.monotonic() + LIMIT_S
+    end_s = time.monotonic() + 3.0 * LIMIT_S  # nothing waits so long but on a loaded machine
     while not condition():
         assert time.monotonic() < end_s, what
         time.sleep(0.005)
@@ -267,14 +267,16 @@ def test_a_record_that_must_arrive_waits_for_a_full_link(join: Any) -> None:
 def test_a_lossless_queue_that_overflows_says_so(join: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("birdslam.runtime.transport.bus.LOSSLESS_DEPTH", 4)
     hub = join("supervisor", hub=True, lossless=True)
-    frames = hub.subscriber("frame")
+    frames, tolerant = hub.subscriber("frame"), hub.subscriber("frame", may_drop=True)
     out = join("capture", lossless=True).publisher("frame")
     assert out.wait_matched(LIMIT_S)
     for frame_id in range(9):
         out.put(frame_ref(frame_id))
-    until(lambda: frames.newest and frames.newest.record.frame_id == 8, "the last frame")
+    for each in (frames, tolerant):
+        until(lambda: each.newest and each.newest.record.frame_id == 8, "the last frame")  # noqa: B023
     with pytest.raises(MessagesLost, match="frame: 5 messages lost behind 4"):
         frames.recv(LIMIT_S)
+    assert (received(tolerant).record.frame_id, tolerant.dropped) == (5, 5)
 
 
 def test_a_matching_wait_ends_in_time_and_when_somebody_comes(join: Any) -> None:

@@ -38,7 +38,7 @@ from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, SpeedRea
 TURN_S = 0.05  # max. interval between two writes
 MAX_TURN_MESSAGES = 256  # written before it checks whether to end
 QUIET_S = 0.2  # without a message: the drive is over
-END_S = 2.0  # after END_OF_SOURCE, for the rest of the map
+END_S = 2.0  # after END_OF_SOURCE and after each later message, for the rest
 HEALTH_NS = 1_000_000_000
 MAX_EVENTS = 256  # queue of liveliness events
 NICENESS = 5  # below the pipeline
@@ -68,10 +68,10 @@ class Recorder:
     ) -> None:
         config = configuration.recording
         self._writer, self._vitals, self._assignment = writer, vitals, assignment
-        self._estimates = bus.subscriber("estimate", config.queue)
+        self._estimates = bus.subscriber("estimate", config.queue, may_drop=True)
         health = (f"health/{name}" for name in (*NODES, MAP.name))
         others = (*(topic for topic in EXACT if topic != "estimate"), *health, "map_pose")
-        self._others = {topic: bus.subscriber(topic, config.queue) for topic in others}
+        self._others = {topic: bus.subscriber(topic, config.queue, may_drop=True) for topic in others}
         self._next: dict[str, Message] = {}  # the oldest unwritten message of each topic
         self._health = bus.publisher("health/record")
         self._events: deque[tuple[int, Alive]] = deque(maxlen=MAX_EVENTS)
@@ -86,6 +86,7 @@ class Recorder:
         self._reported_ns, self._frames, self._frames_reported = time.monotonic_ns(), 0, 0
         self._end_frame: int | None = None  # of END_OF_SOURCE
         self._end_measured = False  # its measurements have arrived, which may be later
+        self._measured_frame = -1
         self._map_frame = -1
         self._speeds: tuple[SpeedReading, ...] = ()  # of the last frame
         self._estimate_frame = -1
@@ -159,9 +160,12 @@ class Recorder:
         return self._end_frame is not None
 
     def dropped(self) -> dict[str, int]:
-        """Returns the number of messages dropped from full queues, by topic."""
+        """Returns the number of messages that were lost, by topic."""
         subscribers = {"estimate": self._estimates, **self._others}
-        return {topic: subscriber.dropped for topic, subscriber in subscribers.items() if subscriber.dropped}
+        lost = {topic: subscriber.dropped for topic, subscriber in subscribers.items() if subscriber.dropped}
+        if self._end_frame is not None and not self._end_measured:  # no later number counts the last ones
+            lost["measurements"] = lost.get("measurements", 0) + self._end_frame - self._measured_frame
+        return lost
 
     def _counters(self) -> dict[str, int]:
         malformed = self._estimates.malformed + sum(s.malformed for s in self._others.values())
@@ -181,6 +185,7 @@ class Recorder:
         elif isinstance(record, Measurements):
             if self._first_measured is None:
                 self._first_measured = record.frame_id
+            self._measured_frame = record.frame_id
             self._end_measured = self._end_measured or Status.END_OF_SOURCE in record.status
             self._draw(scene.from_measurements(record, record.t_utc_ns), t_ns)
         elif isinstance(record, MapPose):
@@ -280,7 +285,9 @@ def record(configuration: Configuration, order: RecorderAssignment, vitals: Vita
     except OSError as error:
         log.error("%s can't be created: %s", order.file, error.strerror)
         return USER_ERROR_STATUS
-    with Bus(configuration.vehicle, RECORDER.name, runtime_dir=configuration.runtime_dir) as bus:
+    with Bus(
+        configuration.vehicle, RECORDER.name, runtime_dir=configuration.runtime_dir, lossless=configuration.lossless
+    ) as bus:
         recorder = Recorder(configuration, bus, writer, vitals, order.assignment)
         vitals.beat()
         vitals.count(ready=1)
@@ -292,8 +299,8 @@ def record(configuration: Configuration, order: RecorderAssignment, vitals: Vita
             and not recorder.over
             and (end_s is None or time.monotonic() < end_s)
         ):
-            recorder.record_received(TURN_S)
-            if recorder.ending and end_s is None:
+            received = recorder.record_received(TURN_S)
+            if recorder.ending and (received or end_s is None):
                 end_s = time.monotonic() + END_S
         while writer.error is None and not recorder.over and recorder.record_received(QUIET_S):
             pass

@@ -86,15 +86,18 @@ class Bus(Closing):
         self._publishers.append(Publisher(self._session, key, spec, self.node, self._lossless))
         return self._publishers[-1]
 
-    def subscriber(self, topic: str, depth: int | None = None) -> Subscriber:
-        """Returns a subscriber of `topic`; `depth` replaces the topology's. Raises KeyError for an unknown topic."""
+    def subscriber(self, topic: str, depth: int | None = None, may_drop: bool = False) -> Subscriber:
+        """Returns a subscriber of `topic`; `depth` replaces the topology's. Raises KeyError for an unknown topic.
+
+        With `may_drop` lost messages are counted on a lossless bus too, in place of MessagesLost.
+        """
         self._check_open()
         key, spec = key_of(self.vehicle, topic), TOPICS[topic]
         depth = spec.depth if depth is None else depth
         depth = max(depth, LOSSLESS_DEPTH) if self._lossless else depth
         if depth < 1:
             raise ValueError(f"{topic}: a queue needs a depth of at least 1, got {depth}")
-        self._subscribers.append(Subscriber(self._session, key, spec, depth, self._lossless))
+        self._subscribers.append(Subscriber(self._session, key, spec, depth, self._lossless and not may_drop))
         return self._subscribers[-1]
 
     def catch_up(self, topic: str, subscriber: Subscriber) -> None:
