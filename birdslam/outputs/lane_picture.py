@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.geometry.arrays import Floats32
 from birdslam.lanes.amodal.lanes import BOUNDARY, ROAD, LanesConfig, LaneView
 
 TITLES = (
@@ -17,19 +16,12 @@ TITLES = (
     "lane boundary, completed",
     "road, completed",
     "lanes",
-    "lane boundary, later frames",
-    "road, later frames",
 )
 HIDDEN_ALPHA = 0.25  # of cells behind lanes
 
 
-def draw_lanes(
-    title: str, image: NDArray[np.uint8], view: LaneView, config: LanesConfig, path: Path, later: Floats32 | None = None
-) -> None:
-    """Draws `image`, (H, W) grey or (H, W, 3) BGR, above the bird's-eye grids (x up, y left).
-
-    `later` (2, rows, columns) holds the observations of the same cells by later frames.
-    """
+def draw_lanes(title: str, image: NDArray[np.uint8], view: LaneView, config: LanesConfig, path: Path) -> None:
+    """Draws `image`, (H, W) grey or (H, W, 3) BGR, above the bird's-eye grids (x up, y left)."""
     # Imported here because matplotlib takes half a second
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -38,8 +30,7 @@ def draw_lanes(
     above = width * image.shape[0] / image.shape[1]
     figure = Figure(figsize=(width, above + 2.9), dpi=80, layout="constrained")
     FigureCanvasAgg(figure)
-    shown = 6 if later is None else 8
-    rows = figure.add_gridspec(2, shown, height_ratios=(above, 2.4))
+    rows = figure.add_gridspec(2, len(TITLES), height_ratios=(above, 2.4))
     top = figure.add_subplot(rows[0, :])
     top.imshow(image if image.ndim == 2 else image[:, :, ::-1], cmap="gray")
     top.set_axis_off()
@@ -47,8 +38,7 @@ def draw_lanes(
     extent = (config.half_width_m, -config.half_width_m, -config.behind_m, config.ahead_m)
     seen, completed = view.seen, view.completed
     grids = [seen[BOUNDARY], seen[ROAD], seen[BOUNDARY], completed[BOUNDARY], completed[ROAD], completed[BOUNDARY]]
-    grids += [] if later is None else [later[BOUNDARY], later[ROAD]]
-    for k, (name, grid) in enumerate(zip(TITLES[:shown], grids, strict=True)):
+    for k, (name, grid) in enumerate(zip(TITLES, grids, strict=True)):
         axes = figure.add_subplot(rows[1, k])
         lanes = {2: view.lanes_seen, 5: view.lanes}.get(k)
         alpha = 1.0 if lanes is None else HIDDEN_ALPHA
@@ -58,7 +48,7 @@ def draw_lanes(
             axes.scatter(cloud[:, 1], cloud[:, 0], s=4, color=f"C{j % 10}")
         axes.plot(0.0, 0.0, "^", color="#35a0d0")
         axes.set(xlim=extent[:2], ylim=extent[2:], aspect="equal")
-        axes.set_title(name, fontsize=9 if later is None else 7)
+        axes.set_title(name, fontsize=9)
         axes.tick_params(labelsize=7)
     figure.supxlabel("left of the ego (m)", fontsize=9)
     figure.savefig(path)

@@ -3,7 +3,7 @@
 Kept: one batch over SE(3) nodes of ego and vehicles; CC edges scaled to metres by the camera's height, CV and VV edges,
 weights of their order (CC well above CV above VV).
 Not kept: their vehicles come from shape priors fitted to keypoints, and their VV edges from these; here both come from
-the log, i.e. from boxes; `shape_prior.Initialised` places the vehicles by a wireframe fitted to these.
+the log, i.e. from boxes.
 """
 
 from __future__ import annotations

@@ -16,7 +16,6 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from birdslam.bench.baselines import batch_se3, cubeslam, nair, namdev
-from birdslam.bench.baselines.shape_prior import Initialised
 from birdslam.bench.baselines.trajectories import LiveTrajectories, Method, Trajectories
 from birdslam.bench.figures import median
 from birdslam.bench.simulation.odometry import SimulatedOdometry
@@ -119,8 +118,6 @@ def methods(config: SlamConfig) -> dict[str, Method]:
         "paper_final": Final("BirdSLAM as published, our smoother", PAPER, SmootherConfig()),
         "batch_se3": batch_se3,
         "nair": nair,
-        "batch_se3_shape": Initialised("Batch SE(3), unscaled odometry, shape prior", batch_se3),
-        "nair_shape": Initialised("Nair et al. (IV 2020), shape prior", nair),
         "namdev": namdev,
         "cubeslam": cubeslam,
     }

@@ -169,10 +169,7 @@ def _preface(setting: Setting, outcomes: Sequence[Outcome]) -> str:
         "exactly: no placing of vehicles makes them better than that. What is placed *by Eq. 1* alone "
         "departs from that: its log is of the paper's own placing of vehicles (Eq. 1 under the box on level ground), "
         "and on images of its whole front end: metres by a moving median, and within 20 m the places that "
-        "Frustum-PointNet reads from the depth network's points. "
-        "So does what has the *shape prior*, with which the paper initialises its baselines: a wireframe fitted to "
-        "each box and the log's distance, as no network for keypoints is at hand "
-        "(birdslam/bench/baselines/shape_prior.py).",
+        "Frustum-PointNet reads from the depth network's points.",
         "The placing's constants were tuned on 0000-0006 and 0008, the simulated odometry is fitted to other clips; "
         "with these, 0010 and 0018 chose four of them and `confirm_hits`, 0020 what tells standing from creeping too "
         "(docs/constants.md). The true poses of 0018 and 0020 are of a stereo SLAM, whose scale is within 3 %; those "

@@ -46,8 +46,6 @@ REDONE_TITLES = {  # of the re-implemented; a batch knows the whole log, as what
     "nair": "Nair, batch",
     "namdev": "Namdev, batch",
     "batch_se3": "batch SE(3)",
-    "nair_shape": "Nair, batch, shape prior",
-    "batch_se3_shape": "batch SE(3), shape prior",
     "cubeslam": "CubeSLAM, batch",
     "paper": "BirdSLAM, live",
     "paper_final": "BirdSLAM, final",

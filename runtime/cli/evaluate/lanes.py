@@ -5,16 +5,14 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from birdslam.bench.lanes.hidden_cells import METHODS, HiddenReport
 from birdslam.bench.lanes.paint_masks import PaintReport
 from birdslam.runtime.cli.arguments import add_config, add_pipeline
 from birdslam.runtime.evaluation.drive_lanes import DriveReport, evaluate_drive
-from birdslam.runtime.evaluation.hidden_lanes import evaluate_hidden
 from birdslam.runtime.evaluation.lanes import draw_frame_lanes
 from birdslam.runtime.evaluation.still_lanes import REPORT, evaluate_paint, evaluate_stills
 from birdslam.runtime.options import configuration_of
 
-KITTI_ROAD, LINES, PAINT, LATER = "kitti-road", "lines", "paint", "later"
+KITTI_ROAD, LINES, PAINT = "kitti-road", "lines", "paint"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -24,9 +22,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--frame", type=int, metavar="N", help="frame to draw; default: the last")
     text = "kitti-road: DIR has single images image_N.png with masks ego_lane_N.png of the ego lane; "
     text += "lines: DRIVE is a rendered drive with true lines, demo:DIR; "
-    text += "paint: DIR has imgs/NAME.png and masks/NAME.png of lane markings, as in comma10k; "
-    text += "later: compares the completed road behind vehicles with later frames of DRIVE"
-    parser.add_argument("--truth", choices=(KITTI_ROAD, LINES, PAINT, LATER), help=text)
+    text += "paint: DIR has imgs/NAME.png and masks/NAME.png of lane markings, as in comma10k"
+    parser.add_argument("--truth", choices=(KITTI_ROAD, LINES, PAINT), help=text)
     text = "camera height above the road, with --truth kitti-road"
     parser.add_argument("--height", type=float, metavar="M", help=text)
     add_config(parser)
@@ -41,9 +38,6 @@ def run(options: argparse.Namespace) -> int:
         return 0
     if options.truth == PAINT:
         print(_paint_text(evaluate_paint(configuration, Path(options.drive))))
-        return 0
-    if options.truth == LATER:
-        print(_hidden_text(evaluate_hidden(configuration, options.drive)))
         return 0
     if options.truth is None:
         print(draw_frame_lanes(configuration, options.drive, options.frame))
@@ -70,15 +64,6 @@ def _paint_text(report: PaintReport) -> str:
         f"{report.network}: {report.images} images, at 5 px: precision {formatted(report.precision)}, "
         f"recall {formatted(report.recall)}, at night {formatted(report.recall_by_night)}"
     )
-    return "\n".join(out)
-
-
-def _hidden_text(report: HiddenReport) -> str:
-    out = [f"{report.drive}: {report.cells} cells behind vehicles in {report.frames} frames, observed by later frames"]
-    for name in METHODS:
-        road, line = report.road_iou[name], report.line_iou[name]
-        ious = (f"{kind} {'-' if iou is None else f'{iou:.3f}'}" for kind, iou in (("road", road), ("lines", line)))
-        out.append(f"  {name:8} IoU of {', of '.join(ious)}")
     return "\n".join(out)
 
 
