@@ -7,7 +7,6 @@ import dataclasses
 import itertools
 import json
 import math
-import re
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +14,11 @@ import pytest
 from msgspec.structs import replace
 
 from birdslam.bench.baselines.trajectories import Trajectories
-from birdslam.bench.simulation.odometry import EXACT, Drift, SimulatedOdometry, SimulationConfig, Walk, fit_drift
+from birdslam.bench.simulation.odometry import EXACT, SimulatedOdometry, SimulationConfig
 from birdslam.bench.tracking import ablation, tables
 from birdslam.bench.tracking.benchmark import (
     EGO,
     PAPER,
-    SEEN_EXACTLY,
     Live,
     Row,
     Truth,
@@ -33,7 +31,7 @@ from birdslam.bench.tracking.benchmark import (
     within,
 )
 from birdslam.bench.tracking.tables import Published, read_published
-from birdslam.frontend import FrontEnd, FrontEndConfig
+from birdslam.frontend import FrontEndConfig
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.weights import weighted
@@ -41,15 +39,13 @@ from birdslam.lanes.amodal.landmark_edges import StaticMapConfig
 from birdslam.perception import Perception, Ready
 from birdslam.runtime.cli.commands import parse
 from birdslam.runtime.cli.evaluate.tracking import evaluate
-from birdslam.runtime.configuration import Configuration, ConfigurationError, SourceConfig, load
-from birdslam.runtime.evaluation.tracking import METHODS, PUBLISHED
+from birdslam.runtime.configuration import Configuration, ConfigurationError, load
+from birdslam.runtime.evaluation.tracking import PUBLISHED
 from birdslam.runtime.evaluation.tracking_job import BY_EQ_1, frames_of
-from birdslam.runtime.options import configuration_of
 from birdslam.slam import SlamConfig
 from birdslam.sources.kitti_tracking import TrackingSequence, open_tracking, read_detections
 from birdslam.sources.recording import DatasetError
-from birdslam.sources.speed_log import SpeedLog
-from birdslam.types import Frame, Measurements, SpeedReading
+from birdslam.types import Measurements
 from tests import tiny_networks as tiny
 from tests import tracking_world
 from tests.test_label_projection import with_right_camera
@@ -89,7 +85,6 @@ def exact_log(sequence: TrackingSequence, tmp_path_factory: pytest.TempPathFacto
 
 def test_an_exact_world_has_hardly_any_error(sequence: TrackingSequence, exact_log: list[Measurements]) -> None:
     trial = run_trial(sequence, exact_log, methods(SlamConfig()))
-    assert set(trial.errors) == {*METHODS, SEEN_EXACTLY}
     assert trial.frames_labelled[EGO] == len(FRAMES)
     for name in ("birdslam", "nair", "cubeslam", "namdev"):
         ego = trial.errors[name][EGO]
@@ -100,14 +95,6 @@ def test_an_exact_world_has_hardly_any_error(sequence: TrackingSequence, exact_l
         assert errors is not None
         assert errors.ate_m < 0.8, car
         assert errors.frames >= trial.frames_labelled[car] - 4  # a track is confirmed by its third sight
-        by_ego = trial.errors[SEEN_EXACTLY][car]
-        assert by_ego is not None
-        assert by_ego.frames == errors.frames
-        assert by_ego.ate_m < 0.05
-    assert trial.hota is not None
-    assert trial.hota > 0.9
-    assert trial.idf1 is not None
-    assert trial.idf1 > 0.9
 
 
 def test_a_log_can_be_made_twice(sequence: TrackingSequence, tmp_path: Path) -> None:
@@ -255,32 +242,6 @@ def test_the_weight_of_landmarks_is_against_that_of_the_odometry(noisy_log: list
         assert own[name].cp_inflation == pytest.approx(1.0 / factor)
 
 
-def test_each_idea_alone_is_one_change_of_the_papers_settings() -> None:
-    """And all of them together leave nothing of the back end that is the paper's."""
-    variants = ablation.idea_variants()
-    assert variants.pop("nothing (the paper)") == PAPER
-    fields = ("weights", "graph")
-    changed: set[str] = set()
-    for name, variant in variants.items():
-        if isinstance(variant, Live):
-            more = {
-                f"{part}.{f}"
-                for part in fields
-                for f in getattr(PAPER, part).__struct_fields__
-                if getattr(getattr(variant, part), f) != getattr(getattr(PAPER, part), f)
-            }
-            assert more, name
-            changed |= more
-    own = ours(SlamConfig())
-    apart = {
-        f"{part}.{f}"
-        for part in fields
-        for f in getattr(PAPER, part).__struct_fields__
-        if getattr(getattr(own, part), f) != getattr(getattr(PAPER, part), f)
-    }
-    assert apart - changed == {"graph.correlation_length_m"}  # which moves no pose, but what is known of the ego's
-
-
 def test_before_lanes_is_a_log_without_landmarks(sequence: TrackingSequence, noisy_log: list[Measurements]) -> None:
     variants = ablation.lane_variants()
     assert tuple(variants) == tables.LANES
@@ -302,15 +263,6 @@ def test_the_papers_frames_are_those_with_most_labels_of_its_cars(sequence: Trac
 
 
 # --- the simulated odometry ---
-
-
-@pytest.mark.parametrize("drift", [Drift(0.02, 0.0, 5.0), Drift(0.0, 0.02, 20.0), Drift(0.01, 0.015, 10.0)])
-def test_a_drift_is_fitted_back(drift: Drift) -> None:
-    walk = Walk(drift, 1, np.random.default_rng(5))
-    series = np.array([walk.draw()[0] for _ in range(40_000)])
-    found = fit_drift([series], [np.ones(len(series))])
-    assert found.sigma == pytest.approx(drift.sigma, rel=0.1)
-    assert found.slow == pytest.approx(drift.slow, abs=0.15 * drift.sigma)
 
 
 def test_the_simulated_odometry_errs_as_it_says() -> None:
@@ -411,49 +363,31 @@ def test_tables_have_every_cell_of_the_paper(published: Published) -> None:
 
 
 def options(*arguments: str) -> argparse.Namespace:
-    return parse(["evaluate", *arguments])
+    return parse(["evaluate", "tracking", *arguments])
 
 
 def test_the_command_writes_its_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     root, out = tracking_world.write(tmp_path / "root"), tmp_path / "out"
-    asked = options(
-        "tracking", str(root), "--frames", "0:25", "--odometry", "truth", "--jobs", "1", "--output", str(out)
-    )
+    asked = options(str(root), "--frames", "0:12", "--seeds", "1", "--jobs", "1", "--output", str(out))
     assert evaluate(asked, Configuration()) == 0
     rows = json.loads((out / "report.json").read_text())
     ours_ = {row["body"]: row for row in rows if row["method"] == "birdslam"}
-    assert ours_["ego"]["ate_m"] < 0.05
-    assert ours_["ego"]["frames"] == 25
+    assert ours_["ego"]["ate_m"] < 1.0
+    assert ours_["ego"]["frames"] == 12
     assert ours_["3"]["sequence"] == "0002"
-    assert {row["method"] for row in rows} == {*METHODS, *BY_EQ_1, SEEN_EXACTLY}
+    assert {row["method"] for row in rows} == {*methods(SlamConfig()), *BY_EQ_1}
     report = (out / "report.md").read_text()
     for number in range(1, 6):
         assert f"## Table {number}" in report
-    assert "## What each idea is worth" in report
-    assert re.search(r"\| 0002 \| true odometry \| vehicles \| frame \| \d+ of 3 \|", report)
-    assert re.search(r"\| 0002 \| 25 \| [\d.]+ \| [\d.]+ \(\d+\) \| [\d.]+ \|", report)  # converged, with its ratio
-    assert "TRUTH" in report
-    assert (out / "bev_0002.png").stat().st_size > 1000
-    assert (out / "runtime.png").stat().st_size > 1000
-    assert json.loads((out / "ablation.json").read_text())
-    assert "sequence 0002: 25 frames" in capsys.readouterr().err
-
-
-def test_the_ablation_alone(tmp_path: Path) -> None:
-    root, out = tracking_world.write(tmp_path / "root"), tmp_path / "out"
-    asked = options("ablation", str(root), "--frames", "0:12", "--seeds", "1", "--jobs", "1", "--output", str(out))
-    assert evaluate(asked, Configuration()) == 0
-    report = (out / "report.md").read_text()
-    assert "## Table 1" not in report
-    assert "## Table 3" in report
     assert "SIMULATED" in report
+    assert "sequence 0002: 12 frames" in capsys.readouterr().err
     names = [*ablation.idea_variants(), *ablation.placed_variants(PAPER)]
     ideas = {(row["method"], row["body"]): row["ate_m"] for row in json.loads((out / "ideas.json").read_text())}
     assert {method for method, _ in ideas} == {f"ideas/{name}" for name in names}
     assert all(f"| {name} |" in report for name in names)
     # The tracking world's car 3 is placed on its centre by ours, on its rear by the paper's Eq. 1
     assert ideas["ideas/vehicles placed by measured ground and size", "3"] < ideas["ideas/nothing (the paper)", "3"]
-    found = {row["method"] for row in json.loads((out / "report.json").read_text())}
+    found = {row["method"] for row in json.loads((out / "ablation.json").read_text())}
     assert found == {f"{m}/{v}" for m in ("paper", "birdslam") for v in tables.CONSTRAINTS + tables.LANDMARKS} | set(
         tables.LANES
     )
@@ -464,84 +398,32 @@ def test_a_sequence_with_images_is_driven_by_them_too(tmp_path: Path) -> None:
     never = tiny.constant(tmp_path / "net.onnx", (1, 3, 64, 64), np.zeros((1, 84, 6), np.float32))
     never.with_suffix(".toml").write_text(tiny.DETECTOR.replace("classes = 2", "classes = 1"))
     without = {"models.shipped": False}
-    asked = [*("tracking", str(root), "--frames", "0:6", "--seeds", "1", "--jobs", "1", "--output", str(out))]
-    with pytest.raises(ConfigurationError, match="needs a detector"):
+    asked = [*(str(root), "--frames", "0:6", "--seeds", "1", "--jobs", "1", "--output", str(out))]
+    with pytest.raises(ConfigurationError, match="need a detector"):
         evaluate(options(*asked), load(None, without))
     configuration = load(None, without | {"models.detector.path": str(never)})
-    assert evaluate(options(*asked, "--methods", "birdslam_live"), configuration) == 0
+    assert evaluate(options(*asked), configuration) == 0
     rows = json.loads((out / "report.json").read_text())
     assert {(row["odometry"], row["detections"]) for row in rows} == {("simulate", "rrc"), ("images", "network")}
     report = (out / "report.md").read_text()
     assert "| 0002 | ego | images | 6 of 6 |" in report
     assert "| 0002 | ego | simulated odometry | 6 of 6 |" in report
-    asked_for = [row["asked"] for row in json.loads((out / "reported.json").read_text()) if "range" in row]
-    assert sum(asked_for) == 6 * 3
-    assert "| 0002 | 15-30 |" in report
-    with pytest.raises(ConfigurationError, match="no image_02, whose boxes these are, but image_03"):
-        evaluate(options(*asked, "--odometry", "images", "--detections", "rrc"), configuration)
-
-
-def test_a_trajectory_file_is_an_odometry(tmp_path: Path) -> None:
-    root, out = tracking_world.write(tmp_path / "root"), tmp_path / "out"
-    rows = np.array([tracking_world.pose_row(k) for k in range(40)])
-    rows[:, 2, 3] *= 1.1
-    path = tmp_path / "mine.txt"
-    path.write_text("".join(" ".join(map(str, row.ravel())) + "\n" for row in rows))
-    asked = options(
-        *("tracking", str(root), "--methods", "nair", "--odometry", str(path), "--jobs", "1", "--output", str(out))
-    )
-    assert evaluate(asked, Configuration()) == 0
-    ego = next(row for row in json.loads((out / "report.json").read_text()) if row["body"] == "ego")
-    assert ego["ate_m"] == pytest.approx(0.1 * 0.8 * np.sqrt(np.mean(np.arange(40) ** 2)), rel=0.02)
 
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
         (["--sequences", "0007"], "no 0007"),
-        (["--methods", "orb"], "unknown orb; expected birdslam"),
-        (["--odometry", "images"], "no image_02"),
-        (["--detections", "network"], "no image_02 or image_03"),
         (["--frames", "30:10"], "expected all, paper or A:B"),
         (["--frames", "x"], "expected all, paper or A:B"),
         (["--seeds", "0"], "--seeds 0"),
-        (["--odometry", "/nowhere.txt"], r"/nowhere\.txt: can't be read"),
-        (["--detections", "/nowhere"], r"/nowhere: no detections of sequence 0002"),
     ],
 )
 def test_a_mistake_is_named(tmp_path: Path, arguments: list[str], said: str) -> None:
     root = tracking_world.write(tmp_path / "root")
-    asked = options("tracking", str(root), *arguments, "--jobs", "1", "--output", str(tmp_path / "out"))
+    asked = options(str(root), *arguments, "--jobs", "1", "--output", str(tmp_path / "out"))
     with pytest.raises((ConfigurationError, DatasetError), match=said):
         evaluate(asked, Configuration())
-
-
-def test_whose_boxes_are_judged_is_no_file_of_boxes_for_the_front_end(tmp_path: Path) -> None:
-    asked = options("tracking", str(tmp_path), "--detections", "network", "--output", str(tmp_path / "out"))
-    assert configuration_of(asked).source.detections == ""
-
-
-def test_a_speed_file_is_for_the_images_alone(tmp_path: Path) -> None:
-    root = tracking_world.write(tmp_path / "root")
-    asked = options("tracking", str(root), "--odometry", "truth", "--output", str(tmp_path / "out"))
-    beside = Configuration(source=SourceConfig(speed=str(tmp_path)))
-    with pytest.raises(ConfigurationError, match="the odometry of 0002 does not use a speed"):
-        evaluate(asked, beside)
-
-
-def test_the_log_holds_the_cars_speed(sequence: TrackingSequence, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen: list[tuple[SpeedReading, ...]] = []
-
-    def measure(self: FrontEnd, frame: Frame, pending: object) -> Measurements:
-        seen.append(frame.speeds)
-        return Measurements(frame_id=frame.frame_id, t_source_ns=0, t_capture_ns=0, t_utc_ns=0)
-
-    monkeypatch.setattr(FrontEnd, "measure", measure)
-    log = SpeedLog([SpeedReading(t_ns=30_000_000 * n, speed_mps=8.0, sigma_mps=0.1) for n in range(20)])
-    nothing = Ready(Perception([], None, {}, ()))
-    make_log(sequence, range(2, 5), None, lambda frame, image: nothing, None, FrontEndConfig(), log)
-    assert seen == [log.until(k * 100_000_000) for k in range(2, 5)]
-    assert seen[0]
 
 
 def test_the_papers_frames_are_the_first(sequence: TrackingSequence, published: Published) -> None:

@@ -70,7 +70,7 @@ def _figures(data: Path, folder: Path, environment: Mapping[str, str], demo_alon
         yield f"{row['sequence']} scale %", 100.0 * row["scale_error"]
     if demo_alone:
         return
-    cars = ("localisation", str(data / TRACKING), "--sequences", CARS_IN, "--detections", "rrc")
+    cars = ("localisation", str(data / TRACKING), "--sequences", CARS_IN)
     _evaluate(environment, *cars, "--output", str(folder / "cars"))
     for row in json.loads((folder / "cars" / "report.json").read_bytes()):
         if row["sequence"] == "all" and row["depth_error_median_rel"] is not None:

@@ -95,8 +95,6 @@ COMMANDS = (
     Command("evaluate car-ahead", "compare the distance to the car ahead with LiDAR",
             "evaluate.odometry", "run_car_ahead"),
     Command("evaluate tracking", "print the paper's Tables 1 to 5 on KITTI tracking", "evaluate.tracking"),
-    Command("evaluate ablation", "print the paper's Tables 3 to 5: constraints, landmark weights and thresholds, lanes",
-            "evaluate.tracking", "run", "add_ablation_arguments"),
     Command("evaluate localisation",
             "compare positions of road users with the labels of KITTI tracking, by range",
             "evaluate.localisation"),

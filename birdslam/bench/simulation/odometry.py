@@ -2,7 +2,7 @@
 
 It takes the place of `birdslam.odometry.odometry.Odometry` in the front end. Errors have a white part and a slow one
 (AR(1)): a scale that is 3 % short stays so for a while. `OdometryNoise` is fitted to KITTI odometry 00 and 06 and to a
-raw clip (`python -m perf odometry_noise`). The ground is reported as calibrated, since no pose says how the camera
+raw clip. The ground is reported as calibrated, since no pose says how the camera
 leans over the road; landmarks are seen over the front end's ground, with the error of our odometry's tilt.
 """
 
@@ -29,7 +29,6 @@ from birdslam.trajectory import Transform, inverse
 from birdslam.types import LandmarkEdge, SpeedReading, Status
 
 NotNegative = Annotated[float, msgspec.Meta(ge=0.0)]
-LAGS = 8  # frames over which `fit_drift` looks at what errors have in common
 
 
 class Drift(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -56,12 +55,12 @@ class OdometryNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     side_per_turn: float = 1.1  # a turn that is missed may be taken for a sidestep
     log_scale: Drift = Drift(0.0193, 0.0114, 5.7)
     ground_rad: Drift = Drift(0.0011, 0.0034, 6.0)  # pitch of the road as estimated from the images
-    roll_rad: Drift = Drift(0.0022, 0.0097, 42.6)  # and its roll (`python -m perf tilt`)
+    roll_rad: Drift = Drift(0.0022, 0.0097, 42.6)  # and its roll
     # Road tracks in sight of a frame that become CP edges: half of the 26 that the odometry follows by itself, since
-    # the networks' road and boxes take the others from the whole front end (`python -m perf edges`)
+    # the networks' road and boxes take the others from the whole front end
     landmarks: NotNegative = 13.0
     landmark_frames: Annotated[float, msgspec.Meta(ge=1.0)] = 5.6  # for how long one is followed
-    # What they err by over the front end's ground (`python -m perf edges`): together as by a pitch and a roll, since a
+    # What they err by over the front end's ground: together as by a pitch and a roll, since a
     # road is no plane, and each by its own
     landmark_pitch_rad: Drift = Drift(0.0, 0.0042, 14.0)
     landmark_roll_rad: Drift = Drift(0.0, 0.013, 14.0)
@@ -227,25 +226,3 @@ def _on_road(camera: Camera, poses: Transform) -> list[SE2]:
         step = inverse(before) @ after
         out.append(out[-1] @ planar(Pose(step[:3, :3], step[:3, 3]), camera.ground))
     return out
-
-
-def fit_drift(errors: list[Floats], weights: list[Floats]) -> Drift:
-    """The Drift of measured errors, one series (N,) for each clip, each with the weights (N,) of its errors.
-
-    The slow part is what errors of frames close by have in common (mean of the products over lags 1-3, about zero, so
-    that a clip's bias counts as slow); its memory is how that decays; what is left is white. Weighting by the distance
-    driven makes angles and scales those that displace most.
-    """
-
-    def product(lag: int) -> float:
-        pairs = [
-            (e[: len(e) - lag] * e[lag:], w[: len(e) - lag] * w[lag:]) for e, w in zip(errors, weights, strict=True)
-        ]
-        total = sum(float(w.sum()) for _, w in pairs)
-        return sum(float((e * w).sum()) for e, w in pairs) / max(total, 1e-12)
-
-    variance, shared = product(0), [product(lag) for lag in range(1, LAGS + 1)]
-    slow = min(max(float(np.mean(shared[:3])), 0.0), variance)
-    late = max(float(np.mean(shared[-3:])), 0.05 * slow)
-    decay = math.log(max(slow / late, 1.05)) if slow > 0.0 else 1.0
-    return Drift(white=math.sqrt(max(variance - slow, 0.0)), slow=math.sqrt(slow), memory_frames=(LAGS - 3.0) / decay)

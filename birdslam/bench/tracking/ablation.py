@@ -17,11 +17,10 @@ import msgspec
 from birdslam.bench.baselines import batch_se3
 from birdslam.bench.baselines.trajectories import Method, Trajectories
 from birdslam.bench.tracking.benchmark import PAPER, Final, Live
-from birdslam.bench.tracking.completed_lanes import of_kind, with_completed_lanes
 from birdslam.geometry.camera import Camera
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.weights import NO_WEIGHT, EdgeType, WeightsConfig
-from birdslam.types import LandmarkKind, Measurements
+from birdslam.types import Measurements
 from birdslam.vehicles.rts_smoother import SmootherConfig
 
 CP_WEIGHTS = MappingProxyType({"cp_low": 0.01, "cp_medium": 1.0, "cp_high": 100.0})  # against CC's own
@@ -57,27 +56,15 @@ def landmark_variants(base: Live) -> dict[str, Live]:
 
 
 def idea_variants() -> dict[str, Method]:
-    """What is ours in the back end, each alone over the paper's, by what it is; for a log of the paper's placing."""
-    default, paper = GraphConfig(), PAPER.graph
-    alone = {
-        "gates on outliers": ("detection_gate_sigma", "landmark_gate_sigma"),
-        "landmarks where the last key frame saw them": ("landmark_anchor",),
-        "standstill held": ("zero_velocity_update",),
-        "a front that may be a back": ("front_back_ambiguity",),
-        "vehicles leave the ego where it is": ("vehicles_move_ego",),
-        "errors of detections that last": ("lasting_share",),
+    """Returns ideas of our back end, each alone added to the paper's method, for a log of the paper's placing."""
+    default = GraphConfig()
+    gates = {name: getattr(default, name) for name in ("detection_gate_sigma", "landmark_gate_sigma")}
+    return {
+        "nothing (the paper)": PAPER,
+        "gates on outliers": replace(PAPER, graph=msgspec.structs.replace(PAPER.graph, **gates)),
+        "measured covariances": replace(PAPER, weights=WeightsConfig(leave_out=())),
+        "the smoother": Final("", PAPER, SmootherConfig()),
     }
-    out: dict[str, Method] = {"nothing (the paper)": PAPER}
-    for name, fields in alone.items():
-        more = {field: getattr(default, field) for field in fields}
-        base = _of_ego_alone(PAPER) if "landmark_anchor" in fields else PAPER
-        out[name] = replace(base, graph=msgspec.structs.replace(paper, **more))
-    out["CP of the ego alone"] = _of_ego_alone(PAPER)
-    out["measured covariances"] = replace(PAPER, weights=WeightsConfig(leave_out=()))
-    steady = replace(PAPER, graph=msgspec.structs.replace(paper, constant_velocity=True))
-    out["constant velocity in place of VV"] = _leave_out(steady, "vv")
-    out["the smoother"] = Final("", PAPER, SmootherConfig())
-    return out
 
 
 def placed_variants(base: Live) -> dict[str, Method]:
@@ -89,14 +76,9 @@ def placed_variants(base: Live) -> dict[str, Method]:
     }
 
 
-def lane_variants(images: bool = False) -> dict[str, Method]:
-    """Table 5: the batch before and after lane constraints; of a log of `images`, which has lanes, also with either."""
-    out: dict[str, Method] = {"before_lanes": _Batch("Batch SE(3) before lane constraints", False)}
-    out["after_lanes"] = batch_se3
-    if images:
-        out["corners_alone"] = _Batch("Batch SE(3), corners alone", of=LandmarkKind.ROAD_POINT)
-        out["completed_lanes"] = _Batch("Batch SE(3), completed lanes alone", of=LandmarkKind.LANE_STATION)
-    return out
+def lane_variants() -> dict[str, Method]:
+    """Table 5: the batch before and after lane constraints."""
+    return {"before_lanes": _BatchWithoutLanes("Batch SE(3) before lane constraints"), "after_lanes": batch_se3}
 
 
 def depth_of(method: Method) -> float:
@@ -106,24 +88,15 @@ def depth_of(method: Method) -> float:
 
 
 @dataclass(frozen=True)
-class _Batch:
+class _BatchWithoutLanes:
     label: str = field(compare=False)
-    landmarks: bool = True
-    of: LandmarkKind | None = None  # lanes are the completed ones then
 
     def run(self, log: Sequence[Measurements], camera: Camera) -> Trajectories:
-        if self.of is not None:
-            log = of_kind(with_completed_lanes(log), self.of)
-        return batch_se3.run(log, camera, self.landmarks)
+        return batch_se3.run(log, camera, lanes=False)
 
 
 def _leave_out(base: Live, edge: EdgeType) -> Live:
     return _reweighted(base, leave_out=tuple({*base.weights.left_out, edge}))
-
-
-def _of_ego_alone(base: Live) -> Live:
-    """Without CP edges of vehicles, which say something only where landmarks stand in the world."""
-    return _reweighted(base, cp_vehicles=None)
 
 
 def _without_vv(base: Live) -> Live:

@@ -19,7 +19,7 @@ from birdslam.bench.baselines import batch_se3, cubeslam, nair, namdev
 from birdslam.bench.baselines.trajectories import LiveTrajectories, Method, Trajectories
 from birdslam.bench.figures import median
 from birdslam.bench.simulation.odometry import SimulatedOdometry
-from birdslam.bench.tracking.metrics import BoxFrame, PathErrors, count_boxes, hota, idf1, match_vehicles, path_errors
+from birdslam.bench.tracking.metrics import PathErrors, match_vehicles, path_errors
 from birdslam.frontend import EgoMotion, FrontEnd, FrontEndConfig, Pending
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
@@ -31,13 +31,11 @@ from birdslam.paper import PAPER as AS_PUBLISHED
 from birdslam.slam import SlamConfig
 from birdslam.sources.kitti import KITTI_RATE_HZ
 from birdslam.sources.kitti_tracking import VEHICLE_KINDS, TrackingSequence
-from birdslam.sources.speed_log import SpeedLog
 from birdslam.types import NS_PER_S, Frame, LandmarkEdge, LandmarkKind, Measurements
 from birdslam.vehicles.placement.pseudolidar import FrustumNetwork
 from birdslam.vehicles.rts_smoother import RtsSmoother, SmootherConfig
 
 EGO = "ego"
-SEEN_EXACTLY = "seen_exactly"  # instead of a method's name: its errors, had the live ego seen every vehicle exactly
 MIN_FRAMES = 5  # a vehicle matched in fewer is left out of the report, unless the paper names it
 
 NO_IMAGE = np.zeros((1, 1), dtype=np.uint8)  # for an odometry that needs none
@@ -130,22 +128,20 @@ def make_log(
     perceive: Callable[[int, NDArray[np.uint8]], Pending],
     images: Callable[[int], NDArray[np.uint8] | None] | None,
     config: FrontEndConfig,
-    speeds: SpeedLog | None = None,
     frustum_network: FrustumNetwork | None = None,
     lane_head: LaneHead | None = None,
 ) -> list[Measurements]:
     """The front end's measurements of `frames`; frame ids are KITTI's.
 
-    `images` gives a frame's image, None where it is unreadable; without `images` the odometry needs none. `speeds` are
-    the car's own, by the frames' time from 0 on. `frustum_network` and `lane_head` are those of `FrontEnd`.
+    `images` returns a frame's image, None if it is unreadable; without `images` the odometry needs none.
+    `frustum_network` and `lane_head` are those of `FrontEnd`.
     """
     frontend, log = FrontEnd(sequence.camera, config, odometry, frustum_network, lane_head or LaneHead()), []
     for index in frames:
         image = NO_IMAGE if images is None else images(index)
         t_ns = round(index / KITTI_RATE_HZ * NS_PER_S)
         pending = perceive(index, NO_IMAGE if image is None else image)
-        said = () if speeds is None else speeds.until(t_ns)
-        m = frontend.measure(Frame(index, t_ns, t_ns, t_ns, image, speeds=said), pending)
+        m = frontend.measure(Frame(index, t_ns, t_ns, t_ns, image), pending)
         if isinstance(odometry, SimulatedOdometry) and m.ground is not None:
             ground = GroundPlane(m.ground.height_m, m.ground.pitch_rad, m.ground.roll_rad)
             m = replace(m, cp=odometry.landmarks(index, ground, config.static_map))
@@ -181,9 +177,7 @@ class Truth:
 
     ego: dict[int, SE2]
     vehicles: dict[int, dict[int, SE2]]  # label's id -> frame -> pose
-    kinds: dict[int, str]
     matches: dict[int, dict[int, int]]  # frame -> label's id -> vehicle
-    boxes: list[BoxFrame]
 
     @staticmethod
     def of(sequence: TrackingSequence, log: Sequence[Measurements]) -> Truth:
@@ -192,7 +186,7 @@ class Truth:
             raise ValueError(f"sequence {sequence.name}: no frames to evaluate")
         first = log[0].frame_id
         ego = sequence.ego_truth(first)
-        out = Truth({m.frame_id: ego[m.frame_id] for m in log}, {}, {}, {}, [])
+        out = Truth({m.frame_id: ego[m.frame_id] for m in log}, {}, {})
         for m in log:
             labels = sequence.labels_of(m.frame_id)
             ids, boxes_px = [edge.vehicle for edge in m.cv], np.array([edge.box_px for edge in m.cv]).reshape(-1, 4)
@@ -200,9 +194,7 @@ class Truth:
                 if label.kind in VEHICLE_KINDS:
                     pose = sequence.vehicle_truth(label, first)
                     out.vehicles.setdefault(label.track, {})[m.frame_id] = pose
-                    out.kinds[label.track] = label.kind
             out.matches[m.frame_id] = match_vehicles(labels, ids, boxes_px)
-            out.boxes.append(count_boxes(labels, ids, boxes_px))
         return out
 
     def found(self, label: int, result: Trajectories) -> dict[int, SE2]:
@@ -214,25 +206,12 @@ class Truth:
                 out[frame] = pose
         return out
 
-    def tracks(self) -> dict[str, int]:
-        """How many tracks held each labelled vehicle, one after the other."""
-        held = {label: {m[label] for m in self.matches.values() if label in m} for label in self.vehicles}
-        return {str(label): len(tracks) for label, tracks in held.items()}
-
     def errors(self, result: Trajectories, bodies: Iterable[str] | None = None) -> dict[str, PathErrors | None]:
         """Errors of "ego" and of every labelled vehicle, or those of `bodies`; None for one that was never found."""
         out = {EGO: path_errors(self.ego, result.ego)}
         asked = self.vehicles if bodies is None else {label for label in self.vehicles if str(label) in bodies}
         for label in sorted(asked):
             out[str(label)] = path_errors(self.vehicles[label], self.found(label, result))
-        return out
-
-    def errors_by_ego(self, result: Trajectories) -> dict[str, PathErrors | None]:
-        """As `errors`, had every vehicle been seen exactly: what of them is the ego's."""
-        out = {EGO: path_errors(self.ego, result.ego)}
-        for label, poses in self.vehicles.items():
-            seen = {k: result.ego[k] @ self.ego[k].between(poses[k]) for k in self.found(label, result) if k in poses}
-            out[str(label)] = path_errors(poses, seen)
         return out
 
 
@@ -247,26 +226,17 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     seeds: int
     ate_m: float | None = None
     ate_m_spread: float | None = None
-    rpe_t_m: float | None = None
-    rpe_r_deg: float | None = None
-    motion_error_m: float | None = None
-    hota: float | None = None  # of the sequence's cars, in the rows of the ego; the same tracks for every method
-    idf1: float | None = None
     odometry: str = ""
     detections: str = ""
-    tracks: float | None = None  # how many of our tracks held the vehicle; the same for every method
     unconverged: int = 0  # the seeds in which the method's solver ended short of its minimum
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One seed: errors by method and body, and the tracks' quality in the image."""
+    """The errors of one seed by method and body."""
 
     errors: Mapping[str, Mapping[str, PathErrors | None]]
     frames_labelled: Mapping[str, int]
-    tracks: Mapping[str, int]  # body -> tracks that held it
-    hota: float | None
-    idf1: float | None
     unconverged: frozenset[str] = frozenset()  # methods whose solver ended short of its minimum
 
 
@@ -288,10 +258,8 @@ def run_trial(
     truth = Truth.of(sequence, log)
     labelled = {EGO: len(truth.ego)} | {str(label): len(poses) for label, poses in truth.vehicles.items()}
     errors = {name: truth.errors(solved[method], bodies) for name, method in chosen.items()}
-    if (live := chosen.get("birdslam_live")) is not None:
-        errors[SEEN_EXACTLY] = truth.errors_by_ego(solved[live])
     unconverged = frozenset(name for name, method in chosen.items() if not solved[method].converged)
-    return Trial(errors, labelled, truth.tracks(), hota(truth.boxes), idf1(truth.boxes), unconverged)
+    return Trial(errors, labelled, unconverged)
 
 
 def summarise(sequence: str, trials: Sequence[Trial], keep: Iterable[str], odometry: str, detections: str) -> list[Row]:
@@ -304,7 +272,6 @@ def summarise(sequence: str, trials: Sequence[Trial], keep: Iterable[str], odome
             frames = float(np.median([0 if errors is None else errors.frames for errors in found]))
             if frames < MIN_FRAMES and body not in keep:
                 continue
-            is_ego = body == EGO
             rows.append(
                 Row(
                     sequence=sequence,
@@ -315,14 +282,8 @@ def summarise(sequence: str, trials: Sequence[Trial], keep: Iterable[str], odome
                     seeds=len(trials),
                     ate_m=median([errors.ate_m for errors in seen]),
                     ate_m_spread=float(np.std([errors.ate_m for errors in seen])) if seen else None,
-                    rpe_t_m=median([errors.rpe_t_m for errors in seen]),
-                    rpe_r_deg=median([errors.rpe_r_deg for errors in seen]),
-                    motion_error_m=median([errors.motion_error_m for errors in seen]),
-                    hota=median([trial.hota for trial in trials]) if is_ego else None,
-                    idf1=median([trial.idf1 for trial in trials]) if is_ego else None,
                     odometry=odometry,
                     detections=detections,
-                    tracks=median([trial.tracks.get(body) for trial in trials]),
                     unconverged=sum(method in trial.unconverged for trial in trials),
                 )
             )

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,21 +17,13 @@ from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
 
 HALF_SPAN = 3  # frames before and after, whose labels count too: a camera pitches within half a second
 MIN_DISTANCE_M, MAX_DISTANCE_M = 5.0, 60.0  # of labels that are used
-MIN_VEHICLES = 2  # a tilt by fewer is not held to another's
 
 
-@dataclass(frozen=True)
-class LabelledGround:
-    """The camera over the road of one frame, the 1-sigma of its pitch and roll (rad), and the vehicles that tell it."""
+def labelled_grounds(sequence: TrackingSequence) -> list[GroundPlane | None]:
+    """Returns the camera over the road of each frame; None if no vehicle is labelled near it.
 
-    ground: GroundPlane
-    sigma_pitch_rad: float
-    sigma_roll_rad: float
-    vehicles: int
-
-
-def labelled_grounds(sequence: TrackingSequence) -> list[LabelledGround | None]:
-    """One for each frame; None where no vehicle is labelled near it. What roads do is `GroundSizeConfig`'s."""
+    The priors of roads are those of `GroundSizeConfig`.
+    """
     road = GroundSizeConfig()
     found: dict[int, list[tuple[int, float, float, float]]] = {}
     for label in sequence.labels:
@@ -40,16 +31,14 @@ def labelled_grounds(sequence: TrackingSequence) -> list[LabelledGround | None]:
         if label.kind in VEHICLE_KINDS and label.truncated <= 0 and MIN_DISTANCE_M < z < MAX_DISTANCE_M:
             slope = (y - sequence.camera.height_m) / z
             found.setdefault(label.frame, []).append((label.track, z, -x / z, slope))
-    out: list[LabelledGround | None] = []
+    out: list[GroundPlane | None] = []
     for frame in range(len(sequence)):
         near = [one for k in range(frame - HALF_SPAN, frame + HALF_SPAN + 1) for one in found.get(k, ())]
         out.append(_fitted(near, sequence.camera.height_m, road) if near else None)
     return out
 
 
-def _fitted(
-    labels: Sequence[tuple[int, float, float, float]], height_m: float, road: GroundSizeConfig
-) -> LabelledGround:
+def _fitted(labels: Sequence[tuple[int, float, float, float]], height_m: float, road: GroundSizeConfig) -> GroundPlane:
     """Least squares with the priors of roads; a vehicle counts once, in however many frames it is labelled."""
     times = Counter(track for track, *_ in labels)
     z, bearing, slope = np.array([numbers for _, *numbers in labels]).T
@@ -58,5 +47,4 @@ def _fitted(
     J = np.column_stack([-np.ones_like(bearing), bearing, np.abs(bearing)])
     cov = np.linalg.inv((J.T * weight) @ J + np.diag(1.0 / road.road_var))
     pitch_rad, roll_rad, _ = (cov @ (J.T * weight) @ slope).tolist()
-    sigma_pitch, sigma_roll, _ = np.sqrt(np.diag(cov)).tolist()
-    return LabelledGround(GroundPlane(height_m, pitch_rad, roll_rad), sigma_pitch, sigma_roll, len(times))
+    return GroundPlane(height_m, pitch_rad, roll_rad)

@@ -15,20 +15,25 @@ import numpy as np
 from birdslam.bench.ego.trajectory_errors import compare, from_first
 from birdslam.bench.figures import median
 from birdslam.bench.tracking.metrics import least_cost, path_errors
-from birdslam.bench.tracking.movers import MIN_SIGHTS, SOON_S, Sight, delay_s, is_reported_driving, stands
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.sources.kitti import KITTI_RATE_HZ
 from birdslam.sources.shipped_drive import DemoRecording, TrueBody
 from birdslam.trajectory import CameraTrajectory, as_poses, ego_pose, inverse, mount_pose, split_pose
-from birdslam.types import Estimate, VehicleEstimate
+from birdslam.types import Estimate, Moves, VehicleEstimate
 
 VEHICLES = ("car", "van", "truck", "bus")
 ASKED_VISIBLE, ASKED_TRUNCATED, ASKED_RANGE_M = 0.5, 0.2, (4.0, 40.0)  # bodies that are to be found
 GATE_M, GATE_REL = 2.0, 0.2  # a vehicle further from a body than the greater of the two (of its range) is another's
 MIN_VISIBLE, MAX_LOG_RANGE = 0.15, 0.6  # of what a mover is judged by: part in view, and 1.8 times as far off
 MIN_FRAMES = 10  # a body matched in fewer is not counted as a vehicle
+STANDS_MPS, DRIVES_MPS = 0.5, 2.0  # true speeds; a track between them is neither stationary nor moving
+REPORTED_DRIVING_MPS = 1.5  # of an estimate, as in the pictures
+MIN_SIGHTS = 5  # at 10 Hz; a shorter track is not counted
+SOON_S = 1.0
+
+Sight = tuple[int, float, VehicleEstimate]  # frame, true speed over the ground in m/s, and what was estimated
 
 
 class DemoGrade(msgspec.Struct, frozen=True, kw_only=True):
@@ -45,7 +50,7 @@ class DemoGrade(msgspec.Struct, frozen=True, kw_only=True):
     vehicle_centre_rel: float | None  # the same over the body's range
     found: float | None  # share of the bodies in clear sight (ASKED_...), frame by frame, that were matched
     reported: float | None = None  # the same with vehicles that the last looks showed, predicted to the frame
-    # Tracks, one of our ids on one body, judged as `birdslam evaluate tracking` does (movers.py)
+    # Tracks, one of our ids on one body
     standing: int = 0
     false_movers: int = 0  # of these, reported to drive
     driving: int = 0  # for a second or longer
@@ -140,7 +145,7 @@ def grade(recording: DemoRecording, estimates: Sequence[Estimate]) -> DemoGrade:
 def _movers(tracks: Sequence[Sequence[Sight]], rate_hz: float) -> dict[str, int]:
     """The fields of a grade that count tracks."""
     long_enough = [seen for seen in tracks if len(seen) >= MIN_SIGHTS / KITTI_RATE_HZ * rate_hz]
-    standing = [seen for seen in long_enough if stands(seen)]
+    standing = [seen for seen in long_enough if all(speed < STANDS_MPS for _, speed, _ in seen)]
     delays = [delay for seen in long_enough if (delay := delay_s(seen, rate_hz)) is not None]
     return {
         "standing": len(standing),
@@ -149,6 +154,20 @@ def _movers(tracks: Sequence[Sequence[Sight]], rate_hz: float) -> dict[str, int]
         "missed_movers": sum(math.isinf(delay) for delay in delays),
         "movers_soon": sum(delay <= SOON_S for delay in delays),
     }
+
+
+def is_reported_driving(vehicle: VehicleEstimate) -> bool:
+    """Whether an estimate shows a moving vehicle in pictures."""
+    return vehicle.moves is Moves.DRIVING and math.hypot(*vehicle.velocity_mps) > REPORTED_DRIVING_MPS
+
+
+def delay_s(seen: Sequence[Sight], rate_hz: float) -> float | None:
+    """Returns the time from the first sight of a moving vehicle to its report; inf: never; None: it did not move."""
+    drives = [frame for frame, speed, _ in seen if speed > DRIVES_MPS]
+    if len(drives) < SOON_S * rate_hz:
+        return None
+    reported = [frame for frame, _, estimate in seen if frame >= drives[0] and is_reported_driving(estimate)]
+    return (reported[0] - drives[0]) / rate_hz if reported else math.inf
 
 
 def in_clear_sight(body: TrueBody) -> bool:

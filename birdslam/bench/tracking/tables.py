@@ -13,10 +13,7 @@ from pathlib import Path
 import msgspec
 
 from birdslam.bench.figures import markdown, mean, number
-from birdslam.bench.tracking.benchmark import EGO, SEEN_EXACTLY, Row, mean_ate_m
-from birdslam.bench.tracking.movers import MoversRow
-from birdslam.bench.tracking.relative_nees import NeesRow
-from birdslam.bench.tracking.reported import MotionRow, RangeRow
+from birdslam.bench.tracking.benchmark import EGO, Row, mean_ate_m
 from birdslam.sources.recording import DatasetError
 
 ODOMETRIES = {  # as it is called in a row, and at length
@@ -25,13 +22,11 @@ ODOMETRIES = {  # as it is called in a row, and at length
         "SIMULATED (true poses with the errors that our image odometry has on real clips, landmarks drawn beside the "
         "true path)",
     ),
-    "truth": ("true odometry", "TRUTH (no error)"),
     "images": ("images", "from the images where a row says so"),
 }
 OURS = {
     "birdslam_live": "ours, live",
     "birdslam": "**ours, final**",
-    SEEN_EXACTLY: "the ego's part: cars seen exactly from ours, live",
 }
 Cells = dict[str, dict[str, float]]  # sequence -> body -> metres
 
@@ -69,11 +64,8 @@ VARIANT_TITLES = {
     "depth_none": "no T",
     "before_lanes": "before lanes",
     "after_lanes": "after lanes",
-    "corners_alone": "corners alone",
-    "completed_lanes": "completed lanes alone",
 }
-CONSTRAINTS, LANDMARKS = tuple(VARIANT_TITLES)[:5], tuple(VARIANT_TITLES)[5:13]
-LANES, LANES_OF_IMAGES = tuple(VARIANT_TITLES)[13:15], tuple(VARIANT_TITLES)[15:]
+CONSTRAINTS, LANDMARKS, LANES = tuple(VARIANT_TITLES)[:5], tuple(VARIANT_TITLES)[5:13], tuple(VARIANT_TITLES)[13:]
 
 
 class PaperSequence(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -98,21 +90,10 @@ class PublishedTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     average_m: dict[str, float] = {}
 
 
-class PublishedRuntime(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Seconds that the paper states for a whole sequence."""
-
-    where: str
-    incremental_s: float
-    batch_s: float
-    frames: int
-    sequence: str
-
-
 class Published(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """birdslam/bench/tracking/published.toml."""
 
     sequences: dict[str, PaperSequence]
-    runtime: PublishedRuntime
     table1: PublishedTable
     table2: PublishedTable
     table3: PublishedTable
@@ -214,12 +195,11 @@ def ideas_table(rows: Sequence[Row], published: Published) -> str:
 
 
 def lanes_table(rows: Sequence[Row], published: Published) -> str:
-    """Table 5, over the paper's bodies, by odometry; what only a log of images has is in columns of its own."""
+    """Table 5, over the paper's bodies, by odometry."""
     head = ["Seq", "Car", "odometry", "frames: published", "at hand"]
     for column in LANES:
         head += [f"{VARIANT_TITLES[column]}: published", "re-implemented"]
-    head += [f"{VARIANT_TITLES[column]}: re-implemented" for column in LANES_OF_IMAGES]
-    rows = [row for row in rows if row.method in (*LANES, *LANES_OF_IMAGES)]
+    rows = [row for row in rows if row.method in LANES]
     table, lines = published.table5, []
     for sequence, paper in published.sequences.items():
         for body in (*paper.bodies, EGO):
@@ -235,94 +215,8 @@ def lanes_table(rows: Sequence[Row], published: Published) -> str:
                 for column in LANES:
                     line.append(number(table.ate_m[column].get(sequence, {}).get(body)))
                     line.append(_row_number(of.get(column), spread=False))
-                line += [_row_number(of.get(column), spread=False) for column in LANES_OF_IMAGES]
                 lines.append(line)
     return markdown(head, lines)
-
-
-def tracks_table(rows: Sequence[Row], method: str) -> str:
-    """What the paper does not report: relative errors, object motion, and the tracks in the image."""
-    head = ["Seq", "odometry", "HOTA", "IDF1", "ego RPE m", "ego RPE deg", "vehicles", "tracks of each"]
-    head += ["ATE m", "RPE m", "RPE deg", "motion m"]
-    lines = []
-    of_method = [row for row in rows if row.method == method]
-    for ego in (row for row in of_method if row.body == EGO):
-        alike = [row for row in of_method if (row.sequence, row.odometry) == (ego.sequence, ego.odometry)]
-        cars = [row for row in alike if row.body != EGO]
-        own = (number(value, 3) for value in (ego.hota, ego.idf1, ego.rpe_t_m, ego.rpe_r_deg))
-        line = [ego.sequence, odometry_title(ego.odometry), *own]
-        line += [str(len(cars)), number(mean(car.tracks for car in cars))]
-        line += [number(mean(getattr(car, name) for car in cars)) for name in ("ate_m", "rpe_t_m", "rpe_r_deg")]
-        lines.append([*line, number(mean(car.motion_error_m for car in cars))])
-    return markdown(head, lines)
-
-
-def ranges_table(rows: Sequence[RangeRow]) -> str:
-    """Of the cars asked for at each range: how many were found, and how far off."""
-    head = ["Seq", "range m", "asked", "found", "depth error", "depth bias", "across m"]
-    lines = [
-        [
-            *(row.sequence, row.range, str(row.asked), number(row.found / row.asked if row.asked else None)),
-            *(_percent(row.depth_error_median_rel), _percent(row.depth_bias_median_rel)),
-            number(row.across_error_median_m),
-        ]
-        for row in rows
-    ]
-    return markdown(head, lines)
-
-
-def motion_table(rows: Sequence[MotionRow]) -> str:
-    """Of the found cars: their velocities, and how many standing and driving ones were reported as the other."""
-    head = ["Seq", "sights", "velocity error m/s", "standing", "false movers", "sure of it"]
-    head += ["driving", "missed movers", "sure of it"]
-    lines = [
-        [
-            row.sequence,
-            str(row.asked),
-            number(row.velocity_error_median_mps),
-            *map(str, (row.standing, row.false_movers, row.false_movers_sure)),
-            *map(str, (row.driving, row.missed_movers, row.missed_movers_sure)),
-        ]
-        for row in rows
-    ]
-    return markdown(head, lines)
-
-
-def movers_table(rows: Sequence[MoversRow]) -> str:
-    """Tracks of standing vehicles that are reported to drive, and of driving ones that are, and in all."""
-    head = ["Seq", "odometry", "standing", "reported to drive", "driving", "reported", "soon"]
-    counts = [(row.standing, len(row.false), row.driving, row.reported, row.soon) for row in rows]
-    lines = [
-        [
-            *(row.sequence, odometry_title(row.odometry), *map(str, count)),
-            "; ".join(f"{one.x_m:.0f}, {one.y_m:.0f}: {one.reported_mps:.1f}" for one in row.false) or "-",
-        ]
-        for row, count in zip(rows, counts, strict=True)
-    ]
-    sums = [str(sum(count)) for count in zip(*counts, strict=True)]
-    return markdown([*head, "where (ahead, left in m: m/s)"], [*lines, ["all", "", *sums, ""]])
-
-
-def nees_table(rows: Sequence[NeesRow]) -> str:
-    """Relative NEES of ego, scale and vehicles, by frame and by 10 m."""
-    head = ["Seq", "odometry", "of", "per", "n", "NEES", "median"]
-    lines = [
-        [
-            row.sequence,
-            odometry_title(row.odometry),
-            row.of,
-            row.per,
-            f"{row.n} of {row.bodies}" if row.of == "vehicles" else str(row.n),
-            number(row.nees),
-            number(row.nees_median),
-        ]
-        for row in rows
-    ]
-    return markdown(head, lines)
-
-
-def _percent(value: float | None) -> str:
-    return "-" if value is None else f"{100.0 * value:.1f} %"
 
 
 def _chosen(rows: Iterable[Row]) -> list[str]:

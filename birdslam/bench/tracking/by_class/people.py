@@ -15,29 +15,21 @@ import msgspec
 import numpy as np
 
 from birdslam.bench.figures import median
-from birdslam.bench.tracking.by_class.class_tracks import (
-    KINDS,
-    METRES,
-    ClassTracks,
-    TracksRow,
-    class_tracks,
-    tracks_row,
-)
+from birdslam.bench.tracking.by_class.class_tracks import KINDS, TracksRow, class_tracks, tracks_row
 from birdslam.bench.tracking.localisation import INSIDE_1_SIGMA, INSIDE_2_SIGMA
-from birdslam.bench.tracking.metrics import assign
+from birdslam.bench.tracking.metrics import BoxFrame, assign
 from birdslam.geometry.arrays import Floats
 from birdslam.perception import Detections
 from birdslam.sources.kitti_tracking import TrackingSequence
 from birdslam.sources.label_projection import Label, hull_px
-from birdslam.types import FollowedPerson, Measurements, Moves
+from birdslam.types import FollowedPerson, Measurements
 from birdslam.vehicles.placement.localisation import iou
 
 PEOPLE = ("pedestrian", "cyclist")
 RANGES_M = ((5.0, 15.0), (15.0, 30.0), (30.0, 50.0))
-WALKING_MPS, STANDING_MPS = 0.5, 0.2  # true speeds: of walking and of standing people
+WALKING_MPS = 0.5  # true speed of walking people
 TRUTH_S = 0.5  # a label's speed is its places' of so long before and after
 MATCH_IOU = 0.4  # of a box with the label's, in the image
-STANDING_EGO = ("0012", "0016", "0017")  # the ego stands, or nearly
 HULL_SIGMA = (0.035, 0.035, 0.035, 0.03)  # of RRC's boxes of people, left, upper, right, lower, of the height
 HULL_MEMORY = 0.7  # of a box's error, from frame to frame at 10 Hz
 
@@ -47,18 +39,11 @@ class PersonError:
     """One person in one frame: true depth, error in ego (2,), its square over its covariance; both speeds."""
 
     sequence: str
-    label: int
-    frame: int
     depth_m: float
-    true_ray: Floats  # (2,) of length 1, from the camera's foot to the person
     error_m: Floats
     mahalanobis2: float
-    log_det_cov: float
     true_mps: Floats  # (2,) in ego
     estimated_mps: Floats
-    stands: bool
-    occluded: int
-    ego_mps: float
 
 
 @dataclass
@@ -66,7 +51,8 @@ class PeopleResult:
     """Of one sequence."""
 
     name: str
-    tracked: ClassTracks
+    kind: str
+    tracked: list[BoxFrame]
     errors: list[PersonError] = field(default_factory=list)
 
 
@@ -82,9 +68,6 @@ class PeopleRow(msgspec.Struct, frozen=True, kw_only=True):
     inside_1_sigma: float | None = None
     inside_2_sigma: float | None = None
     walking_speed_error_median_mps: float | None = None  # of the velocity's both components together
-    standing_speed_median_mps: float | None = None
-    walking_along_ray_median_mps: float | None = None  # its part away from the camera, which only sizes and rows show
-    walking_across_ray_median_mps: float | None = None
 
 
 def has_labels(sequence: TrackingSequence, kind: str) -> bool:
@@ -134,9 +117,8 @@ def boxes_of_hulls(sequence: TrackingSequence, recorded: Sequence[Detections], k
 def judge(sequence: TrackingSequence, measurements: Iterable[Measurements], kind: str) -> PeopleResult:
     """What the records say of the people of a kind, in every frame, against the labels."""
     measurements = list(measurements)
-    result = PeopleResult(sequence.name, class_tracks(sequence, measurements, kind))
+    result = PeopleResult(sequence.name, kind, class_tracks(sequence, measurements, kind))
     places = _true_places(sequence, KINDS[kind])
-    ego = sequence.ego_truth(0)
     for m in measurements:
         here = sequence.labels_of(m.frame_id)
         asked = [label for label in here if label.kind in KINDS[kind]]
@@ -145,12 +127,9 @@ def judge(sequence: TrackingSequence, measurements: Iterable[Measurements], kind
         overlap = iou(
             np.array([a.box_px for a in asked]).reshape(-1, 4), np.array([p.box_px for p in seen]).reshape(-1, 4)
         )
-        before, after = max(0, m.frame_id - 2), min(len(ego) - 1, m.frame_id + 2)
-        step = ego[before].between(ego[after])
-        ego_mps = math.hypot(step.x_m, step.y_m) / max(0.1 * (after - before), 0.1)
         for i, j in zip(*assign(overlap, MATCH_IOU), strict=True):
             if asked[i].truncated <= 0:
-                result.errors.append(_error(sequence, asked[i], seen[j], places, ego_mps))
+                result.errors.append(_error(sequence, asked[i], seen[j], places))
     return result
 
 
@@ -174,46 +153,33 @@ def _true_velocity(places: dict[int, Floats], frame: int) -> Floats:
 
 
 def _error(
-    sequence: TrackingSequence,
-    label: Label,
-    person: FollowedPerson,
-    places: dict[int, dict[int, Floats]],
-    ego_mps: float,
+    sequence: TrackingSequence, label: Label, person: FollowedPerson, places: dict[int, dict[int, Floats]]
 ) -> PersonError:
     truth = sequence.vehicle_truth(label, label.frame)
     error = np.array([person.x_m - truth.x_m, person.y_m - truth.y_m])
     R = sequence.ego_truth(0)[label.frame].rotation()
     return PersonError(
         sequence=sequence.name,
-        label=label.track,
-        frame=label.frame,
         depth_m=truth.x_m,
-        true_ray=np.array([truth.x_m, truth.y_m]) / math.hypot(truth.x_m, truth.y_m),
         error_m=error,
         mahalanobis2=float(error @ np.linalg.solve(np.reshape(person.cov, (2, 2)), error)),
-        log_det_cov=float(np.linalg.slogdet(np.reshape(person.cov, (2, 2)))[1]),
         true_mps=_true_velocity(places[label.track], label.frame) @ R,
         estimated_mps=np.array([person.vx_mps, person.vy_mps]),
-        stands=person.moves is Moves.STANDING,
-        occluded=label.occluded,
-        ego_mps=ego_mps,
     )
 
 
 def summarise_people(results: Sequence[PeopleResult]) -> tuple[list[PeopleRow], list[TracksRow]]:
-    """Rows for each sequence, of places by range and of tracks; then of where the ego drives, where it stands, all."""
-    moving = [r for r in results if r.name not in STANDING_EGO]
-    standing = [r for r in results if r.name in STANDING_EGO]
+    """Returns rows of positions by range and of tracks, for each sequence and for all."""
     groups = [(r.name, [r]) for r in results]
     if len(results) > 1:
-        groups += [("ego drives", moving), ("ego stands", standing), ("all", list(results))]
+        groups.append(("all", list(results)))
     groups = [(name, group) for name, group in groups if any(r.errors for r in group)]
     rows = [
         _row(name, f"{near:.0f}-{far:.0f}", [e for r in group for e in r.errors if near <= e.depth_m < far])
         for name, group in groups
         for near, far in RANGES_M
     ]
-    return rows, [tracks_row(name, METRES, [r.tracked for r in group]) for name, group in groups]
+    return rows, [tracks_row(name, group[0].kind, [r.tracked for r in group]) for name, group in groups]
 
 
 def _row(sequence: str, span: str, errors: Sequence[PersonError]) -> PeopleRow:
@@ -224,11 +190,7 @@ def _row(sequence: str, span: str, errors: Sequence[PersonError]) -> PeopleRow:
     spread = np.array([e.mahalanobis2 for e in errors])
     true = np.array([e.true_mps for e in errors])
     estimated = np.array([e.estimated_mps for e in errors])
-    speed = np.linalg.norm(true, axis=1)
-    walking, standing = speed > WALKING_MPS, speed < STANDING_MPS
-    off = estimated - true
-    ray = np.array([e.true_ray for e in errors])
-    off_along, off_across = (off * ray).sum(axis=1), off[:, 1] * ray[:, 0] - off[:, 0] * ray[:, 1]
+    walking = np.linalg.norm(true, axis=1) > WALKING_MPS
     return PeopleRow(
         sequence=sequence,
         range=span,
@@ -238,8 +200,5 @@ def _row(sequence: str, span: str, errors: Sequence[PersonError]) -> PeopleRow:
         lateral_error_median_m=float(np.median(np.abs(across))),
         inside_1_sigma=float(np.mean(spread <= INSIDE_1_SIGMA)),
         inside_2_sigma=float(np.mean(spread <= INSIDE_2_SIGMA)),
-        walking_speed_error_median_mps=median(np.linalg.norm(off, axis=1)[walking]),
-        standing_speed_median_mps=median(np.linalg.norm(estimated, axis=1)[standing]),
-        walking_along_ray_median_mps=median(np.abs(off_along)[walking]),
-        walking_across_ray_median_mps=median(np.abs(off_across)[walking]),
+        walking_speed_error_median_mps=median(np.linalg.norm(estimated - true, axis=1)[walking]),
     )
