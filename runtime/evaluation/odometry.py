@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from birdslam.bench.ego.trajectory_errors import OdometryReport, evaluate_recordings
+from birdslam.bench.ego.trajectory_errors import OdometryReport, evaluate_recordings, has_evo
 from birdslam.runtime.batch.offline import Drive, pipeline
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.nodes.sources import open_recorded, recording_uri
@@ -23,6 +23,8 @@ def evaluate_odometry(configuration: Configuration, sequences: Sequence[str], co
 
     `sequences`: KITTI directories or URIs of sources. Raises ConfigurationError, DatasetError, ResultsError.
     """
+    if not has_evo():
+        raise ConfigurationError("trajectories are compared by evo: pip install 'birdslam[evaluate]'")
     source = configuration.source
     if source.frames is not None or source.loop:
         raise ConfigurationError("source.frames, source.loop: evaluate processes whole recordings once; remove both")

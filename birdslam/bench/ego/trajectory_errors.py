@@ -1,4 +1,4 @@
-"""How good a trajectory is: ATE, RPE and scale against ground truth, with evo's definitions.
+"""ATE, RPE and scale of a trajectory against ground truth. RPE and the aligned ATE are computed by evo.
 
 Poses are (N, 4, 4) `T_first_i` in camera-0 axes. Nothing is aligned but the first pose, except where a name says se3 or
 sim3. KITTI's own poses are interpolated over the first dozen frames of a sequence (a constant twist: in 00 the heading
@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +19,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from birdslam.bench.ego.car_ahead import CarAhead, CarAheadReport
-from birdslam.bench.ego.consistency import Consistency, ConsistencyReport
-from birdslam.bench.ego.motion_consistency import MotionConsistencyReport, Motions
+from birdslam.bench.ego.motion_consistency import MotionConsistency, Motions
 from birdslam.geometry.arrays import Bools, Floats
 from birdslam.outputs.drive_files import Recorder, claim_directory, write_json
 from birdslam.sources.recording import DatasetError, Recording
@@ -37,7 +38,7 @@ class OdometryReport(msgspec.Struct, frozen=True, kw_only=True):
     frames: int
     path_m: float | None = None  # of the truth
     ate_m: float | None = None  # root mean square of the positions' errors in 3-D, first pose aligned, no scale
-    ate_sim3_m: float | None = None  # the same after the best similarity (Umeyama 1991)
+    ate_sim3_m: float | None = None  # the same after the best similarity (Umeyama 1991); None without evo, as RPE
     scale_error: float | None = None  # estimated path over true path, less 1
     rpe_t_m: float | None = None  # root mean square over steps of one frame
     rpe_r_deg: float | None = None
@@ -49,8 +50,7 @@ class OdometryReport(msgspec.Struct, frozen=True, kw_only=True):
     statuses: dict[str, int] = {}  # how many frames carried each status
     speed_sources: dict[str, int] = {}  # on how many frames the metres rested on each source
     car_ahead: CarAheadReport | None = None  # where the recording has LiDAR
-    ego: ConsistencyReport | None = None  # what the ego's covariance is worth; None where only some frames are compared
-    motion: MotionConsistencyReport | None = None  # ... and each motion's, and what the truth is worth; None: as above
+    motion: MotionConsistency | None = None  # NEES of 10 m; None if only some frames are compared
     segment_t_pct: float | None = None  # mean error of stretches of SEGMENTS_M, each aligned at its own first pose:
     segment_r_deg_per_m: float | None = None  # what the truth's first poses lack touches only those that begin there
 
@@ -82,20 +82,6 @@ def ate_m(truth: Transform, estimated: Transform, axes: tuple[int, ...] = (0, 1,
     return rms(np.linalg.norm(difference[:, axes], axis=1))
 
 
-def ate_aligned_m(truth: Transform, estimated: Transform, with_scale: bool) -> float:
-    """The same after the motion that fits best (Umeyama 1991, Eqs. 34-42), with its scale or without: what is left is
-    shape."""
-    goal, points = truth[:, :3, 3], estimated[:, :3, 3]
-    goal0, points0 = goal - goal.mean(axis=0), points - points.mean(axis=0)
-    U, d, Vt = np.linalg.svd(goal0.T @ points0 / len(goal))
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])
-    R = U @ np.diag(signs) @ Vt
-    variance = float(np.mean(np.sum(points0**2, axis=1)))
-    moved = variance > 1e-12  # an estimate that never moved has no scale: only its place fits
-    scale = float(d @ signs) / variance if with_scale and moved else 1.0
-    return rms(np.linalg.norm(goal0 - scale * points0 @ R.T, axis=1))
-
-
 def scale_error(truth: Transform, estimated: Transform) -> float | None:
     """Estimated path length over the true one, less 1; None where the truth stands still."""
     path_m = path_length_m(truth)
@@ -118,14 +104,36 @@ def standing_drift_m(truth: Transform, estimated: Transform) -> float | None:
     return drift
 
 
-def rpe(truth: Transform, estimated: Transform) -> tuple[float, float]:
-    """Relative pose error over steps of one frame: root mean squares of translation (m) and rotation angle (deg)."""
-    if len(truth) < 2:
-        return 0.0, 0.0
-    steps = (inverse(poses[:-1]) @ poses[1:] for poses in (truth, estimated))
-    error = inverse(next(steps)) @ next(steps)
-    angles = Rotation.from_matrix(error[:, :3, :3]).magnitude()
-    return rms(np.linalg.norm(error[:, :3, 3], axis=1)), float(np.rad2deg(rms(angles)))
+def has_evo() -> bool:
+    """Whether evo is installed (extra `evaluate`), which computes RPE and aligned ATE."""
+    return find_spec("evo") is not None
+
+
+def evo_errors(truth: Transform, estimated: Transform) -> dict[str, float]:
+    """Returns `rpe_t_m`, `rpe_r_deg`, `ate_se3_m` and `ate_sim3_m` by evo.
+
+    RPE is over steps of one frame. Fields that are not defined are left out: all of fewer than three poses, aligned
+    ATE of an estimate that does not move.
+    """
+    from evo.core import metrics  # of the extra `evaluate`
+    from evo.core.geometry import GeometryException
+    from evo.core.trajectory import PosePath3D
+
+    def rmse(metric: Any, path: Any) -> float:
+        metric.process_data((reference, path))
+        return float(metric.get_statistic(metrics.StatisticsType.rmse))
+
+    if len(truth) < 3:
+        return {}
+    reference, path = (PosePath3D(poses_se3=list(poses)) for poses in (truth, estimated))
+    relations = {"rpe_t_m": metrics.PoseRelation.translation_part, "rpe_r_deg": metrics.PoseRelation.rotation_angle_deg}
+    out = {name: rmse(metrics.RPE(relation, 1, metrics.Unit.frames), path) for name, relation in relations.items()}
+    for name, with_scale in (("ate_se3_m", False), ("ate_sim3_m", True)):
+        with suppress(GeometryException):
+            path = PosePath3D(poses_se3=list(estimated))
+            path.align(reference, correct_scale=with_scale)
+            out[name] = rmse(metrics.APE(metrics.PoseRelation.translation_part), path)
+    return out
 
 
 def segment_errors(truth: Transform, estimated: Transform) -> tuple[float, float] | None:
@@ -173,18 +181,13 @@ def compare(
             sequence=sequence, frames=len(estimated), path_estimated_m=path_estimated_m, statuses=statuses
         )
     path_m, error_m = path_length_m(truth), ate_m(truth, estimated)
-    rpe_t_m, rpe_r_deg = rpe(truth, estimated)
     segments = segment_errors(truth, estimated)
     return OdometryReport(
         sequence=sequence,
         frames=len(estimated),
         path_m=path_m,
         ate_m=error_m,
-        ate_sim3_m=ate_aligned_m(truth, estimated, with_scale=True),
-        ate_se3_m=ate_aligned_m(truth, estimated, with_scale=False),
         scale_error=scale_error(truth, estimated),
-        rpe_t_m=rpe_t_m,
-        rpe_r_deg=rpe_r_deg,
         ate_planar_m=ate_m(truth, estimated, GROUND_AXES),
         ate_pct=100.0 * error_m / path_m if path_m > 0.0 else None,
         path_estimated_m=path_estimated_m,
@@ -192,6 +195,7 @@ def compare(
         statuses=statuses,
         segment_t_pct=None if segments is None else segments[0],
         segment_r_deg_per_m=None if segments is None else segments[1],
+        **(evo_errors(truth, estimated) if has_evo() else {}),
     )
 
 
@@ -234,14 +238,13 @@ def evaluate_recordings(
     report = []
     for recording, truth in zip(recordings, truths, strict=True):
         mount, ahead = recording.camera.ground, CarAhead.of(recording)
-        ego, motions = Consistency(mount), Motions(mount)
+        motions = Motions(mount)
         with Recorder(directory / recording.name, recording.camera) as recorder:
             for record in run(recording):
                 if isinstance(record, MapUpdate):
                     recorder.add_map(record)
                 elif isinstance(record, Estimate):
                     recorder.add(record)
-                    ego.add(record)
                     if ahead:
                         ahead.add_estimate(record)
                 else:
@@ -259,7 +262,7 @@ def evaluate_recordings(
         if goal is not None and compared == slice(None):
             T_cam0_cam = recording.T_cam0_cam()
             of_camera = inverse(T_cam0_cam) @ goal @ T_cam0_cam
-            row = msgspec.structs.replace(row, ego=ego.report(of_camera), motion=motions.report(of_camera))
+            row = msgspec.structs.replace(row, motion=motions.report(of_camera))
         report.append(msgspec.structs.replace(row, car_ahead=ahead.report()) if ahead else row)
         write_json(directory / "report.json", report)  # after each: a long evaluation keeps what it has
     return report

@@ -21,10 +21,7 @@ from birdslam.trajectory import Transform, inverse, mount_pose, split_pose
 _EVEN_RAD, _EVEN_STEPS = 3e-5, 4
 _DRIVES_M = 0.05  # in one step: a standing camera turns evenly as well
 ACCELERATION_MPS2 = 15.0  # no car changes its speed faster
-_STRAIGHT_PER_M, _STRAIGHT_M, _STEP_M = 0.003, 10.0, 0.3  # curvature of a straight road; its least way; of a step
-_BEND_STEPS = 5  # over which the curvature is taken
-# 1-sigma of the angle from the axes of poses by GPS/IMU to their way, from drive to drive: `axes_off_way` is +12, +2
-# mrad of KITTI odometry 00, 06 and -7, -9, -6, +3, +2, -3, +1, -4, -4 of tracking 0001-0006, 0008, 0010, 0018
+# 1-sigma of the angle from the axes of GPS/IMU poses to the direction of travel, which differs between drives
 AXES_SIGMA_RAD = 0.006
 
 
@@ -65,23 +62,6 @@ def step_noise(poses: Transform, mount: GroundPlane) -> Floats:
         return np.zeros(3)
     out: Floats = np.minimum(np.sqrt(np.mean(jerks**2, axis=0)), 1.4826 * np.median(np.abs(jerks), axis=0))
     return out / np.sqrt(6.0)
-
-
-def axes_off_way(poses: Transform, mount: GroundPlane) -> float | None:
-    """The angle from the axes of poses (N, 4, 4) to their way on straight road, to the left; None: too little of it.
-
-    It is the camera's own yaw on the car, the same in all of a car's drives, and the error of the poses' headings.
-    """
-    moves = np.array([(step.x_m, step.y_m, step.yaw_rad) for step in steps(poses, mount)]).reshape(-1, 3)
-    if len(moves) < _BEND_STEPS:
-        return None
-    way_m = np.hypot(moves[:, 0], moves[:, 1])
-    over = np.ones(_BEND_STEPS)
-    bend = np.convolve(moves[:, 2], over, "same") / np.maximum(np.convolve(way_m, over, "same"), _DRIVES_M)
-    straight = (way_m > _STEP_M) & (np.abs(bend) < _STRAIGHT_PER_M) & ~interpolated(poses)[1:]
-    if way_m[straight].sum() < _STRAIGHT_M:
-        return None
-    return float(np.arctan2(moves[straight, 1].sum(), moves[straight, 0].sum()))
 
 
 def implausible(poses: Transform, t_ns: Ints) -> Bools:

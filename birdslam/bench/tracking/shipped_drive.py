@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
-from birdslam.bench.ego.trajectory_errors import compare, from_first
+from birdslam.bench.ego.trajectory_errors import ate_m, from_first, path_length_m, scale_error
 from birdslam.bench.figures import median
 from birdslam.bench.tracking.metrics import least_cost, path_errors
 from birdslam.geometry.arrays import Floats
@@ -119,7 +119,8 @@ def grade(recording: DemoRecording, estimates: Sequence[Estimate]) -> DemoGrade:
         found += len(clear & {body.body for body, _ in matched})
         in_sight = match(estimate, bodies, [v for v in estimate.vehicles if v.in_sight])
         reported += len(clear & {body.body for body, _ in in_sight})
-    ego = compare(recording.name, truth[[e.frame_id for e in estimates]], np.array(cameras), {})
+    goal, poses = truth[[e.frame_id for e in estimates]], np.array(cameras)
+    path_m, error_m = path_length_m(goal), ate_m(goal, poses)
     ates = [
         errors_of.ate_m
         for body, path in paths.items()
@@ -128,10 +129,10 @@ def grade(recording: DemoRecording, estimates: Sequence[Estimate]) -> DemoGrade:
     distance, reach = np.array(errors).reshape(-1, 2).T
     return DemoGrade(
         frames=len(estimates),
-        path_m=ego.path_m or 0.0,
-        ego_ate_m=ego.ate_m or 0.0,
-        ego_ate_pct=ego.ate_pct,
-        ego_scale_error=ego.scale_error,
+        path_m=path_m,
+        ego_ate_m=error_m,
+        ego_ate_pct=100.0 * error_m / path_m if path_m > 0.0 else None,
+        ego_scale_error=scale_error(goal, poses),
         vehicles=len(ates),
         vehicle_ate_m=median(ates),
         vehicle_centre_m=median(distance),

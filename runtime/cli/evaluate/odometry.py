@@ -80,14 +80,7 @@ def _table(reports: Sequence[OdometryReport]) -> str:
         ("RPE deg", "rpe_r_deg", 4),
         ("segments %", "segment_t_pct", 2),
         ("still m", "standing_drift_m", 3),
-        ("NEES", "ego.nees", 2),
-        ("inside 95 %", "ego.inside_95", 2),
-        ("motion NEES", "motion.frames.nees", 2),
-        ("median", "motion.frames.nees_median", 2),
-        ("measured", "motion.frames.nees_measured", 2),
-        ("10 m NEES", "motion.stretches.nees", 2),
-        ("median", "motion.stretches.nees_median", 2),
-        ("measured", "motion.stretches.nees_measured", 2),
+        ("10 m NEES", "motion.nees", 2),
     )
     lines = [f"{'sequence':16}" + "".join(f"{title:>12}" for title, _, _ in columns)]
     for report in reports:
@@ -98,7 +91,7 @@ def _table(reports: Sequence[OdometryReport]) -> str:
 
 
 def _field(report: Any, name: str) -> float | None:
-    """Returns a field or a nested field of a report, as in `ego.nees`; None if it is missing."""
+    """Returns a field or a nested field of a report, as in `motion.nees`; None if it is missing."""
     for part in name.split("."):
         report = None if report is None else getattr(report, part)
     return cast("float | None", report)
