@@ -6,13 +6,13 @@ import math
 
 import numpy as np
 
-from birdslam.bench.simulation.places import block
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.closing import close_loops
 from birdslam.loops.drift import CORRELATION_M, MIN_SCALE_REL, link_cov
 from birdslam.loops.gnss.factors import Node
 from birdslam.loops.keyframe import Link
+from birdslam.perf.maps.places import block
 
 ROUND_M, STEP_M = 2000.0, 4
 CARRIED_FROM_M, AGAIN_M = 800.0, 200.0  # of a round's way, and that is driven twice

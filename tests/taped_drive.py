@@ -8,8 +8,8 @@ from typing import Any
 
 import msgspec
 
-from birdslam.bench.simulation.drive import DriveConfig, drive
 from birdslam.geometry.camera import Camera
+from birdslam.perf.latency.drive import DriveConfig, drive
 from birdslam.runtime.configuration import Configuration, RuntimeConfig
 from birdslam.runtime.nodes.capture import stamps
 from birdslam.runtime.nodes.checkpoints import CheckpointFile

@@ -7,11 +7,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from birdslam.bench.simulation.drive import DriveConfig, drive
 from birdslam.bench.tracking import ablation
 from birdslam.bench.tracking.benchmark import PAPER, Live, ours
 from birdslam.geometry.arrays import Floats
 from birdslam.graph.pose_graph import PoseGraph
+from birdslam.perf.latency.drive import DriveConfig, drive
 from birdslam.slam import SlamConfig
 
 WORLD = drive(DriveConfig(frames=25, rate_hz=10.0, vehicles=2, landmarks=12, noise=0.0, traffic="convoy"), seed=2)

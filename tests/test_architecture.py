@@ -13,7 +13,7 @@ FOLDERS = {"birdslam": "birdslam", "runtime": "birdslam.runtime", "perf": "birds
 IMPURE = {"zenoh", "time", "threading", "logging", "os", "multiprocessing", "subprocess", "psutil", "asyncio", "socket"}
 ONLY_IN = {  # third-party library: the packages that may import it
     "onnxruntime": {"perception", "runtime.world"},
-    "gtsam": {"bench.baselines", "loops"},
+    "gtsam": {"bench.baselines", "loops", "perf"},
     "torch": {"world.training", "runtime.world", "perf"},
     "numba": {"world", "world.training", "perf"},
     "ray": {"runtime.batch"},

@@ -12,12 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from birdslam.bench.simulation.drive import DriveConfig, drive
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.lanes.amodal.atlas import Atlas, AtlasConfig
+from birdslam.perf.latency.drive import DriveConfig, drive
 from birdslam.queries import MapSnapshot, Trajectory
 from birdslam.types import Estimate, MapUpdate, VehicleEstimate
 

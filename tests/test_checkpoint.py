@@ -10,12 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from birdslam.bench.simulation.drive import DriveConfig, drive
 from birdslam.graph.checkpoint import CheckpointError, pack, packed, unpack, unpacked
 from birdslam.graph.factors.landmark_points import LandmarkPoints, LandmarksState
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
+from birdslam.perf.latency.drive import DriveConfig, drive
 from birdslam.types import Measurements, Status
 
 SETTINGS = {

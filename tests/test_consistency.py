@@ -10,8 +10,6 @@ import pytest
 from msgspec.structs import replace
 from scipy.stats import chi2
 
-from birdslam.bench.baselines.batch_se2 import Solution, ego_key, solve, vehicle_key
-from birdslam.bench.simulation.drive import Drive, DriveConfig, drive
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.planar import between
 from birdslam.geometry.se2 import SE2
@@ -21,6 +19,8 @@ from birdslam.graph.weights import WeightsConfig
 from birdslam.odometry.road.fit import RoadFit
 from birdslam.odometry.road.kalman_filter import RoadFilter
 from birdslam.odometry.scale_config import RoadScaleConfig
+from birdslam.perf.latency.batch_se2 import Solution, ego_key, solve, vehicle_key
+from birdslam.perf.latency.drive import Drive, DriveConfig, drive
 from birdslam.types import EgoEdge, Estimate, Measurements, VehicleEdge
 from tests.recordings import KITTI as CAMERA
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from birdslam.bench.simulation.drive import DriveConfig, drive
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.checkpoint import CheckpointError
@@ -21,6 +20,7 @@ from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.state_layout import OF_VEHICLE, StateLayout
 from birdslam.graph.weights import WeightsConfig
 from birdslam.graph.window import EGO_PLACE, Window
+from birdslam.perf.latency.drive import DriveConfig, drive
 from birdslam.types import Estimate
 
 SETTINGS = GraphConfig(), WeightsConfig()

@@ -85,7 +85,7 @@ def test_a_recording_gives_the_trajectories_that_are_evaluated_bit_for_bit(tmp_p
     final = tracks(tmp_path / "out" / "tracks")
     assert final == smoothed(zip(frames, tape.estimates, strict=False))
     assert found == len(final) > 1
-    evaluated = Final("", ours(SlamConfig()), SmootherConfig()).run(frames, CAMERA)
+    evaluated = Final(ours(SlamConfig()), SmootherConfig()).run(frames, CAMERA)
     assert {vehicle: len(poses) for vehicle, poses in final.items()} == {
         vehicle: len(poses) for vehicle, poses in evaluated.vehicles.items()
     }

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from birdslam.bench.baselines.batch_se2 import ego_key, solve
-from birdslam.bench.simulation.drive import DriveConfig, drive
 from birdslam.graph.g2o import g2o_lines
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.weights import WeightsConfig
+from birdslam.perf.latency.batch_se2 import ego_key, solve
+from birdslam.perf.latency.drive import DriveConfig, drive
 from birdslam.types import Measurements
 
 CONFIG = DriveConfig(frames=30, rate_hz=10.0, vehicles=2, landmarks=6, traffic="convoy")

@@ -16,7 +16,6 @@ import numpy as np
 import pymap3d
 import pytest
 
-from birdslam.bench.simulation.places import CAMERA
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.drift import link_cov
 from birdslam.loops.gnss.earth import EarthError, GnssFix, align_with_fixes
@@ -25,6 +24,7 @@ from birdslam.loops.gnss.sentences import NmeaReader
 from birdslam.loops.keyframe import Link
 from birdslam.outputs import placed
 from birdslam.outputs.placed import Place, write_around, write_places
+from birdslam.perf.maps.places import CAMERA
 from birdslam.runtime.configuration import ConfigurationError, load
 from birdslam.runtime.maps.drive_earth import write_earth
 from birdslam.runtime.maps.gnss_input import Receiver, recorded_fixes

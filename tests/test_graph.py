@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from birdslam.bench.baselines.posegraph3 import BatchConfig
-from birdslam.bench.simulation.drive import Drive, DriveConfig, drive
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.planar import between
 from birdslam.geometry.se2 import SE2
@@ -30,6 +29,7 @@ from birdslam.graph.state_layout import StateLayout
 from birdslam.graph.weights import WeightsConfig
 from birdslam.perf.__main__ import main as perf_main
 from birdslam.perf.latency import incremental, optimizer
+from birdslam.perf.latency.drive import Drive, DriveConfig, drive
 from birdslam.perf.latency.optimizer import CONTENDERS
 from birdslam.types import EgoEdge, Estimate, LandmarkEdge, LanePoint, Measurements, Status
 
@@ -530,7 +530,7 @@ REPLAY = """
 import hashlib, msgspec
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
-from birdslam.bench.simulation.drive import DriveConfig, drive
+from birdslam.perf.latency.drive import DriveConfig, drive
 from birdslam.graph.weights import WeightsConfig
 graph = PoseGraph(GraphConfig(), WeightsConfig(leave_out=()))
 world = drive(DriveConfig(frames=150, outliers=0.05, drop=0.1), seed=17)

@@ -12,8 +12,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from birdslam.bench.simulation.places import CAMERA, along, build, drive
 from birdslam.geometry.se2 import SE2
+from birdslam.perf.maps.places import CAMERA, along, build, drive
 from birdslam.runtime.configuration import load
 from birdslam.runtime.maps import map_process
 from birdslam.runtime.maps.map_process import WAITING_IMAGES, LiveMap

@@ -9,12 +9,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from birdslam.bench.simulation.places import CAMERA, along, build, drive
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.gnss.earth import Earth
 from birdslam.loops.map_file import HEAD, MAGIC, decode_map, encode_map
 from birdslam.loops.place_map import MapCamera, PlaceMap
 from birdslam.loops.session import MapSession
+from birdslam.perf.maps.places import CAMERA, along, build, drive
 from birdslam.runtime.maps.map_export import export_map
 from birdslam.types import LaneLine, Lanes, LineColour, LineKind
 

@@ -13,7 +13,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from birdslam.bench.simulation.places import CAMERA, OTHER_LIGHT_BITS, Street, along, block, build, drive
 from birdslam.geometry.arrays import Ints
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.closing import close_loops, held
@@ -29,6 +28,7 @@ from birdslam.loops.place_map import MapCamera, PlaceMap
 from birdslam.loops.session import MapSession
 from birdslam.loops.verification import OTHER_VIEW_PX, LocalMap, locate
 from birdslam.outputs.map_trajectory import MapTrajectory, TrajectoryFiles
+from birdslam.perf.maps.places import CAMERA, OTHER_LIGHT_BITS, Street, along, block, build, drive
 from birdslam.runtime.batch.one_map import DRIVE_MAP, join
 from birdslam.runtime.cli.commands import parse
 from birdslam.runtime.configuration import ConfigurationError, load

@@ -13,9 +13,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from birdslam.bench.simulation.drive import DriveConfig, drive
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.pose_graph import PoseGraph
+from birdslam.perf.latency.drive import DriveConfig, drive
 from birdslam.runtime.configuration import BudgetsConfig, Configuration, DegradationConfig, RuntimeConfig, SourceConfig
 from birdslam.runtime.nodes.checkpoints import MAX_BYTES, CheckpointFile, newest_checkpoint
 from birdslam.runtime.nodes.coasting import Overdue, PendingFrames, deadline_ns, unmeasured

@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from birdslam.bench.baselines.batch_se2 import ego_key, solve, vehicle_key
-from birdslam.bench.simulation.drive import Drive, DriveConfig, drive
 from birdslam.bench.tracking.benchmark import PAPER
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
@@ -20,6 +18,8 @@ from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.graph.window import Window
+from birdslam.perf.latency.batch_se2 import ego_key, solve, vehicle_key
+from birdslam.perf.latency.drive import Drive, DriveConfig, drive
 from birdslam.slam import SlamConfig
 from birdslam.types import Estimate, LandmarkEdge, Measurements, Status
 

@@ -14,11 +14,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from birdslam.bench.simulation.drive import DriveConfig
 from birdslam.geometry.se2 import SE2
 from birdslam.perf.__main__ import main
 from birdslam.perf.errors import PerfError
 from birdslam.perf.latency import convoy, optimizer, system, transport
+from birdslam.perf.latency.drive import DriveConfig
 from birdslam.perf.latency.live import Run, Sample
 from birdslam.perf.reporting import all as everything
 from birdslam.perf.reporting import compare, ratios, report

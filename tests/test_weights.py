@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from birdslam.bench.simulation.drive import DriveConfig, drive
 from birdslam.graph.weights import WeightsConfig, weighted
+from birdslam.perf.latency.drive import DriveConfig, drive
 
 FRAME = drive(DriveConfig(frames=40, vehicles=6), seed=3).measurements[-1]
 

@@ -1,5 +1,5 @@
-"""What judges the method: against poses, labels and LiDAR, beside other methods, and on simulated drives.
+"""Evaluation of the method against poses, labels and LiDAR, beside other methods.
 
-Nothing of the method imports it. `ego` grades trajectories, `tracking` has the paper's tables, `baselines` what it
-compares with, `simulation` drives without images.
+Nothing of the method imports it. `ego` evaluates trajectories, `tracking` has the paper's tables, `baselines` the other
+methods of these tables, `simulation` odometry for sequences without images.
 """

@@ -21,8 +21,8 @@ import msgspec
 import numpy as np
 import psutil
 
-from birdslam.bench.simulation.drive import DriveConfig, drive
 from birdslam.perf.errors import PerfError
+from birdslam.perf.latency.drive import DriveConfig, drive
 from birdslam.perf.reporting.figures import curve, noise, spread
 from birdslam.perf.reporting.machine import Steal
 from birdslam.runtime.configuration import Configuration, complete, load, parse_setting

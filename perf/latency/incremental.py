@@ -15,15 +15,16 @@ from typing import Any
 
 import numpy as np
 
-from birdslam.bench.baselines import batch_se2, batch_se3, nair
-from birdslam.bench.baselines.batch_se2 import Solution
+from birdslam.bench.baselines import batch_se3, nair
 from birdslam.bench.baselines.posegraph3 import Convergence, solve_batch
-from birdslam.bench.simulation.drive import Drive, DriveConfig, drive
 from birdslam.bench.tracking.benchmark import PAPER, ours
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
+from birdslam.perf.latency import batch_se2
+from birdslam.perf.latency.batch_se2 import Solution
+from birdslam.perf.latency.drive import Drive, DriveConfig, drive
 from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
 from birdslam.slam import SlamConfig

@@ -25,11 +25,11 @@ import numpy as np
 import psutil
 from msgspec.structs import replace
 
-from birdslam.bench.baselines.smoothers import Smoother
-from birdslam.bench.simulation.drive import DriveConfig, drive
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
+from birdslam.perf.latency.drive import DriveConfig, drive
+from birdslam.perf.latency.smoothers import Smoother
 from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.reporting.figures import Ledger, curve, noise, spread
 from birdslam.perf.reporting.machine import Steal

@@ -12,7 +12,6 @@ import msgspec
 import numpy as np
 import pymap3d
 
-from birdslam.bench.simulation.places import CAMERA, OTHER_LIGHT_BITS, SAME_BITS, Street, along, block, build, drive
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.features import DESCRIPTOR_BYTES
 from birdslam.loops.gnss.earth import GnssFix
@@ -24,6 +23,7 @@ from birdslam.loops.map_pose import MapState
 from birdslam.loops.place_map import MapCamera, PlaceMap
 from birdslam.loops.session import MapSession
 from birdslam.outputs.placed import Place
+from birdslam.perf.maps.places import CAMERA, OTHER_LIGHT_BITS, SAME_BITS, Street, along, block, build, drive
 from birdslam.perf.reporting.figures import Ledger
 from birdslam.runtime.maps.drive_earth import write_earth
 from birdslam.types import NS_PER_S, Attitude

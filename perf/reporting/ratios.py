@@ -17,8 +17,8 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from birdslam.bench.simulation.drive import DriveConfig
 from birdslam.perf.latency import optimizer, transport
+from birdslam.perf.latency.drive import DriveConfig
 from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
 

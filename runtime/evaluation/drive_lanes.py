@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import msgspec
-import numpy as np
 
 from birdslam.bench.lanes.true_lines import LineScores, LinesReport
 from birdslam.bench.lanes.true_vehicles import VehicleScores, VehiclesReport
@@ -52,9 +51,8 @@ def evaluate_drive(configuration: Configuration, drive: str) -> DriveReport:
             if frame.image is None:
                 continue
             truth = recording.truth_lines(frame.frame_id)
-            lines.add(frame.t_source_ns * 1e-9, estimate.lanes, truth)
+            lines.add(estimate.lanes, truth)
             vehicles.add(estimate, recording.truth_bodies(frame.frame_id), truth)
-    path_m = float(np.linalg.norm(np.diff(recording.truth_poses()[:, :3, 3], axis=0), axis=1).sum())
-    report = DriveReport(lines=lines.report(recording.name, path_m), vehicles=vehicles.report())
+    report = DriveReport(lines=lines.report(recording.name), vehicles=vehicles.report())
     write_json(output / "report.json", report)
     return report

@@ -54,11 +54,11 @@ def evaluate_paint(configuration: Configuration, folder: Path) -> PaintReport:
     return report
 
 
-def evaluate_stills(configuration: Configuration, folder: Path, height_m: float | None) -> StillsReport:
+def evaluate_stills(configuration: Configuration, folder: Path) -> StillsReport:
     """Scores all pairs of image and mask in a folder independently; writes the report and a picture of each.
 
-    The camera is that of the configuration or of KITTI; `height_m` overrides its height. Raises ConfigurationError,
-    DatasetError, ModelError, ResultsError.
+    The camera is that of the configuration or of KITTI. Raises ConfigurationError, DatasetError, ModelError,
+    ResultsError.
     """
     pairs = find_pairs(folder)
     output = Path(configuration.output)
@@ -72,7 +72,7 @@ def evaluate_stills(configuration: Configuration, folder: Path, height_m: float 
         for pair in pairs:
             image, mask = read_pair(pair)
             try:
-                camera = camera_of(image, configuration.camera, height_m)
+                camera = camera_of(image, configuration.camera)
             except DatasetError as error:
                 raise DatasetError(f"{pair.image}: {error}") from None
             perception = inference.networks.start(0, image).result()  # always frame 0: no result is carried over

@@ -18,7 +18,6 @@ from birdslam.geometry.camera import Camera
 from birdslam.graph.weights import PAPER_WEIGHTS
 from birdslam.types import Measurements
 
-label = "Batch SE(3), unscaled odometry"
 CONFIG = BatchConfig(metric=False, landmarks=True, weights=PAPER_WEIGHTS)
 
 

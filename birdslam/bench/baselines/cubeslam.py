@@ -22,8 +22,6 @@ from birdslam.geometry.se2 import SE2
 from birdslam.graph.weights import WeightsConfig
 from birdslam.types import Measurements, VehicleEdge
 
-label = "CubeSLAM"
-
 
 class CuboidConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Priors on size and heading, how well boxes fit, and how steadily vehicles move from one frame to the next."""

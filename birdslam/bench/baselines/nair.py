@@ -15,7 +15,6 @@ from birdslam.bench.baselines.trajectories import Trajectories
 from birdslam.geometry.camera import Camera
 from birdslam.types import Measurements
 
-label = "Nair et al. (IV 2020)"
 CONFIG = BatchConfig(metric=True, landmarks=False)
 
 

@@ -21,8 +21,6 @@ from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.types import Measurements, VehicleEdge
 
-label = "Namdev et al."
-
 
 class NamdevConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The scale of an object is the height in metres that its box stands for."""

@@ -14,7 +14,6 @@ import gtsam
 import msgspec
 import numpy as np
 
-from birdslam.bench.baselines.batch_se2 import landmark_key
 from birdslam.bench.baselines.trajectories import Trajectories
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
@@ -246,6 +245,11 @@ class _Builder:
         """The derivative by the scale of the least cost: where the poses are best, that of the CC edges alone."""
         ahead, behind = (self._motions(scale + side * _SCALE_STEP).error(solution) for side in (1.0, -1.0))
         return float((ahead - behind) / (2.0 * _SCALE_STEP) + (scale - 1.0) / _WIDE_SCALE**2)
+
+
+def landmark_key(kind: LandmarkKind, landmark: int) -> int:
+    """Returns the key of the position of a landmark; each kind has its own ids."""
+    return int(gtsam.symbol("l" if kind is LandmarkKind.ROAD_POINT else "m", landmark))
 
 
 def _vehicle_key(vehicle: int, frame: int) -> int:

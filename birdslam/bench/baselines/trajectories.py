@@ -26,9 +26,6 @@ class Trajectories:
 class Method(Protocol):
     """Whatever makes trajectories of a log: a module of this package, or a back end of ours."""
 
-    @property
-    def label(self) -> str: ...
-
     def run(self, log: Sequence[Measurements], camera: Camera) -> Trajectories: ...
 
 

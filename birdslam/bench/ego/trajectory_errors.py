@@ -16,7 +16,6 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from birdslam.bench.ego.car_ahead import CarAhead, CarAheadReport
 from birdslam.bench.ego.motion_consistency import MotionConsistency, Motions
@@ -26,9 +25,7 @@ from birdslam.sources.recording import DatasetError, Recording
 from birdslam.trajectory import Transform, as_poses, inverse, read_kitti
 from birdslam.types import Estimate, MapUpdate, Measurements
 
-STANDING_RADIUS_M, STANDING_FRAMES = 0.05, 10  # a car whose truth stays within it for so long stands
 SEGMENTS_M = (10.0, 20.0, 30.0, 40.0, 50.0)  # KITTI's benchmark has 100 to 800 m, longer than a clip
-GROUND_AXES = (0, 2)  # x right and z forward of a camera: what is left of a position on the road
 
 
 class OdometryReport(msgspec.Struct, frozen=True, kw_only=True):
@@ -42,17 +39,14 @@ class OdometryReport(msgspec.Struct, frozen=True, kw_only=True):
     scale_error: float | None = None  # estimated path over true path, less 1
     rpe_t_m: float | None = None  # root mean square over steps of one frame
     rpe_r_deg: float | None = None
-    ate_planar_m: float | None = None  # of the two ground axes
     ate_pct: float | None = None  # ate_m in percent of path_m
     ate_se3_m: float | None = None  # after the best rigid motion, no scale: a truth whose first pose is off shows here
     path_estimated_m: float = 0.0
-    standing_drift_m: float | None = None  # how far the estimate strays while the truth stands; None: it never does
     statuses: dict[str, int] = {}  # how many frames carried each status
     speed_sources: dict[str, int] = {}  # on how many frames the metres rested on each source
     car_ahead: CarAheadReport | None = None  # where the recording has LiDAR
     motion: MotionConsistency | None = None  # NEES of 10 m; None if only some frames are compared
-    segment_t_pct: float | None = None  # mean error of stretches of SEGMENTS_M, each aligned at its own first pose:
-    segment_r_deg_per_m: float | None = None  # what the truth's first poses lack touches only those that begin there
+    segment_t_pct: float | None = None  # mean error of segments of SEGMENTS_M, each aligned at its first pose
 
 
 def rms(errors: Floats) -> float:
@@ -76,32 +70,15 @@ def in_camera0(poses: Transform, T_cam0_cam: Transform) -> Transform:
     return out
 
 
-def ate_m(truth: Transform, estimated: Transform, axes: tuple[int, ...] = (0, 1, 2)) -> float:
-    """Absolute trajectory error: root mean square distance of positions along `axes`, both from their first pose."""
-    difference = from_first(estimated)[:, :3, 3] - from_first(truth)[:, :3, 3]
-    return rms(np.linalg.norm(difference[:, axes], axis=1))
+def ate_m(truth: Transform, estimated: Transform) -> float:
+    """Absolute trajectory error: root mean square distance of positions, both from their first pose."""
+    return rms(np.linalg.norm(from_first(estimated)[:, :3, 3] - from_first(truth)[:, :3, 3], axis=1))
 
 
 def scale_error(truth: Transform, estimated: Transform) -> float | None:
     """Estimated path length over the true one, less 1; None where the truth stands still."""
     path_m = path_length_m(truth)
     return path_length_m(estimated) / path_m - 1.0 if path_m > 0.0 else None
-
-
-def standing_drift_m(truth: Transform, estimated: Transform) -> float | None:
-    """The largest distance of the estimate from its place when the car stopped; None: it never stops."""
-    goal, points = truth[:, :3, 3], estimated[:, :3, 3]
-    drift, first = None, 0
-    while first < len(goal):
-        away = np.flatnonzero(np.linalg.norm(goal[first:] - goal[first], axis=1) > STANDING_RADIUS_M)
-        frames = int(away[0]) if len(away) else len(goal) - first
-        if frames >= STANDING_FRAMES:
-            strayed = np.linalg.norm(points[first : first + frames] - points[first], axis=1).max()
-            drift = max(drift or 0.0, float(strayed))
-            first += frames
-        else:
-            first += 1
-    return drift
 
 
 def has_evo() -> bool:
@@ -136,11 +113,10 @@ def evo_errors(truth: Transform, estimated: Transform) -> dict[str, float]:
     return out
 
 
-def segment_errors(truth: Transform, estimated: Transform) -> tuple[float, float] | None:
-    """KITTI's odometry metric (Geiger et al. 2012): over stretches of SEGMENTS_M of the truth's way from every frame.
+def segment_error_pct(truth: Transform, estimated: Transform) -> float | None:
+    """KITTI's odometry metric (Geiger et al. 2012) over segments of SEGMENTS_M of the true path from each frame.
 
-    The mean error of their end in percent of their length, and of their direction in degrees a metre; None where the
-    truth is shorter than all of them.
+    Returns the mean error of their end points in percent of their length; None if the truth is shorter than all.
     """
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1))])
     pairs = [
@@ -154,9 +130,7 @@ def segment_errors(truth: Transform, estimated: Transform) -> tuple[float, float
     first, last, length = (np.array(column) for column in zip(*pairs, strict=True))
     goal, own = (inverse(poses[first]) @ poses[last] for poses in (truth, estimated))
     error = inverse(own) @ goal
-    turned_deg = np.rad2deg(Rotation.from_matrix(error[:, :3, :3]).magnitude())
-    strayed = np.linalg.norm(error[:, :3, 3], axis=1)
-    return 100.0 * float(np.mean(strayed / length)), float(np.mean(turned_deg / length))
+    return 100.0 * float(np.mean(np.linalg.norm(error[:, :3, 3], axis=1) / length))
 
 
 def compare(
@@ -181,20 +155,16 @@ def compare(
             sequence=sequence, frames=len(estimated), path_estimated_m=path_estimated_m, statuses=statuses
         )
     path_m, error_m = path_length_m(truth), ate_m(truth, estimated)
-    segments = segment_errors(truth, estimated)
     return OdometryReport(
         sequence=sequence,
         frames=len(estimated),
         path_m=path_m,
         ate_m=error_m,
         scale_error=scale_error(truth, estimated),
-        ate_planar_m=ate_m(truth, estimated, GROUND_AXES),
         ate_pct=100.0 * error_m / path_m if path_m > 0.0 else None,
         path_estimated_m=path_estimated_m,
-        standing_drift_m=standing_drift_m(truth, estimated),
         statuses=statuses,
-        segment_t_pct=None if segments is None else segments[0],
-        segment_r_deg_per_m=None if segments is None else segments[1],
+        segment_t_pct=segment_error_pct(truth, estimated),
         **(evo_errors(truth, estimated) if has_evo() else {}),
     )
 

@@ -45,9 +45,6 @@ class StillScore(msgspec.Struct, frozen=True, kw_only=True):
 
     image: str
     ego_lane_iou: float  # in bird's-eye view to 30 m, of what the image shows of the lane
-    ego_lane_iou_image: float  # in the image
-    pitch_deg: float  # that made the lines parallel
-    lines: int
     width_m: float | None = None  # None: no lane was found
     left: Bound | None = None
     right: Bound | None = None
@@ -58,9 +55,7 @@ class StillsReport(msgspec.Struct, frozen=True, kw_only=True):
 
     images: int
     ego_lane_iou_mean: float
-    ego_lane_iou_image_mean: float
     ego_lane_iou_least: float
-    without_lane: int  # images in which none was found; their IoU is 0
     networks: tuple[str, ...]
     by_image: tuple[StillScore, ...]
 
@@ -94,7 +89,7 @@ def read_pair(pair: Pair) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     return np.asarray(image, np.uint8), np.asarray(mask, np.uint8)
 
 
-def camera_of(image: NDArray[np.uint8], stated: Camera | None, height_m: float | None) -> Camera:
+def camera_of(image: NDArray[np.uint8], stated: Camera | None) -> Camera:
     """The stated camera, or KITTI's, for an image of this size. Raises DatasetError where that can't be."""
     height_px, width_px = image.shape[:2]
     if stated is not None:
@@ -102,7 +97,7 @@ def camera_of(image: NDArray[np.uint8], stated: Camera | None, height_m: float |
             raise DatasetError(
                 f"an image of {width_px}x{height_px} does not fit the camera of {stated.width_px}x{stated.height_px}"
             )
-        return stated if height_m is None else msgspec.structs.replace(stated, height_m=height_m)
+        return stated
     try:
         return Camera(
             width_px=width_px,
@@ -111,7 +106,7 @@ def camera_of(image: NDArray[np.uint8], stated: Camera | None, height_m: float |
             fy_px=FOCAL_PX,
             cx_px=CENTRE_PX[0],
             cy_px=CENTRE_PX[1],
-            height_m=HEIGHT_M if height_m is None else height_m,
+            height_m=HEIGHT_M,
         )
     except ValueError as error:
         raise DatasetError(f"an image of {width_px}x{height_px} is none of KITTI's camera: {error}") from None
@@ -145,9 +140,6 @@ def score(name: str, camera: Camera, still: Still, mask: NDArray[np.uint8]) -> S
     return StillScore(
         image=name,
         ego_lane_iou=iou(still.area[cells], truth[cells], counted[cells]),
-        ego_lane_iou_image=iou(still.area, truth, counted),
-        pitch_deg=float(np.degrees(still.ground.pitch_rad)),
-        lines=len(still.lines),
         width_m=None if lane is None else lane.width_m,
         left=None if lane is None else lane.left_bound,
         right=None if lane is None else lane.right_bound,
@@ -178,9 +170,7 @@ def report_of(scores: list[StillScore], networks: tuple[str, ...]) -> StillsRepo
     return StillsReport(
         images=len(scores),
         ego_lane_iou_mean=float(np.mean(by_road)),
-        ego_lane_iou_image_mean=float(np.mean([s.ego_lane_iou_image for s in scores])),
         ego_lane_iou_least=min(by_road),
-        without_lane=sum(s.width_m is None for s in scores),
         networks=networks,
         by_image=tuple(scores),
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 
 import msgspec
@@ -20,13 +19,12 @@ KERB = "kerb"
 
 
 class RangeScore(msgspec.Struct, frozen=True, kw_only=True):
-    """Lateral errors of lines so far ahead."""
+    """Lateral errors of painted lines at one distance."""
 
     ahead_m: float
     lines: int
     error_median_m: float | None = None
     error_p95_m: float | None = None
-    bias_m: float | None = None  # median of the signed errors, > 0: found too far to the left
     within_2_sigma: float | None = None
 
 
@@ -36,14 +34,9 @@ class LinesReport(msgspec.Struct, frozen=True, kw_only=True):
     drive: str
     frames: int
     ranges: tuple[RangeScore, ...]
-    heading_error_median_deg: float | None
     recall: float | None  # share of the painted lines within 6 m that were found, over all frames
-    false_lines_per_km: float | None  # lines by their numbers
-    ego_lane_share: float  # of frames with an ego lane
     ego_lane_wrong: float  # share of frames whose ego lane has a bound off by more than RIGHT_M at 10 m
     width_error_rel: float | None  # median, signed; of lanes between two painted lines
-    jitter_m: float | None  # standard deviation of the change of the centre's error at 10 m, frame by frame
-    found_after_s: float | None  # time from the first frame to the first right ego lane
 
 
 @dataclass
@@ -51,87 +44,51 @@ class LineScores:
     """Collects frame by frame."""
 
     errors: dict[float, list[tuple[float, float]]] = field(default_factory=lambda: {x: [] for x in RANGES_M})
-    headings: list[float] = field(default_factory=list)
     seen: int = 0
     found: int = 0
-    false_ids: set[int] = field(default_factory=set)
     frames: int = 0
-    with_lane: int = 0
     wrong: int = 0
     widths: list[float] = field(default_factory=list)
-    centres: list[float] = field(default_factory=list)
-    changes: list[float] = field(default_factory=list)
-    first_right_s: float | None = None
 
-    def add(self, t_s: float, lanes: Lanes | None, truth: tuple[TrueLine, ...]) -> None:
-        """One frame, `t_s` after the first."""
+    def add(self, lanes: Lanes | None, truth: tuple[TrueLine, ...]) -> None:
+        """Adds a frame."""
         self.frames += 1
         lines = () if lanes is None else lanes.lines
         matched = match(lines, truth)
-        self._add_lines(lines, matched, truth)
-        own = None if lanes is None else lanes.ego
-        self._add_lane(t_s, own, truth)
-
-    def _add_lines(
-        self, lines: tuple[LaneLine, ...], matched: dict[int, TrueLine], truth: tuple[TrueLine, ...]
-    ) -> None:
         for line in lines:
             true = matched.get(line.line)
-            if true is None:
-                if line.kind is not LineKind.EDGE:
-                    self.false_ids.add(line.line)
-                continue
-            if line.kind is LineKind.EDGE:
+            if true is None or line.kind is LineKind.EDGE:
                 continue
             for x in RANGES_M:
                 y = y_at(true, x)
                 if y is not None and x <= line.to_m:
                     self.errors[x].append((line.y_m(x) - y, line.sigma_m(x)))
-            near, far = y_at(true, 8.0), y_at(true, 12.0)
-            if near is not None and far is not None:
-                self.headings.append(math.atan((line.y_m(12.0) - line.y_m(8.0)) / 4.0) - math.atan((far - near) / 4.0))
         wanted = [t for t in truth if t.kind != KERB and _is_near(t)]
         self.seen += len(wanted)
         self.found += sum(any(true is t for true in matched.values()) for t in wanted)
+        if lanes is not None and lanes.ego is not None:
+            self._add_lane(lanes.ego, truth)
 
-    def _add_lane(self, t_s: float, own: Lane | None, truth: tuple[TrueLine, ...]) -> None:
-        if own is None:
-            self.centres.clear()
-            return
-        self.with_lane += 1
+    def _add_lane(self, own: Lane, truth: tuple[TrueLine, ...]) -> None:
         bounds = ego_bounds(truth, MATCH_AT_M)
         if bounds is None:
             return
         left, right = bounds
-        off = abs(own.left_m(MATCH_AT_M) - left), abs(own.right_m(MATCH_AT_M) - right)
-        if max(off) > RIGHT_M:
+        if max(abs(own.left_m(MATCH_AT_M) - left), abs(own.right_m(MATCH_AT_M) - right)) > RIGHT_M:
             self.wrong += 1
-            self.centres.clear()
-            return
-        if self.first_right_s is None:
-            self.first_right_s = t_s
-        if own.left_bound is Bound.PAINT and own.right_bound is Bound.PAINT:
+        elif own.left_bound is Bound.PAINT and own.right_bound is Bound.PAINT:
             width = own.left_m(MATCH_AT_M) - own.right_m(MATCH_AT_M)
             self.widths.append(width / (left - right) - 1.0)
-        error = own.centre_m(MATCH_AT_M) - 0.5 * (left + right)
-        if self.centres:
-            self.changes.append(error - self.centres[-1])
-        self.centres.append(error)
 
-    def report(self, drive: str, driven_m: float) -> LinesReport:
-        """What was collected over so much way."""
+    def report(self, drive: str) -> LinesReport:
+        """Returns the scores of all frames."""
         return LinesReport(
             drive=drive,
             frames=self.frames,
             ranges=tuple(_range_score(x, self.errors[x]) for x in RANGES_M),
-            heading_error_median_deg=median(np.degrees(np.abs(self.headings))),
             recall=self.found / self.seen if self.seen else None,
-            false_lines_per_km=len(self.false_ids) / driven_m * 1e3 if driven_m > 0.0 else None,
-            ego_lane_share=self.with_lane / max(self.frames, 1),
             ego_lane_wrong=self.wrong / max(self.frames, 1),
             width_error_rel=median(self.widths),
-            jitter_m=float(np.std(self.changes)) if self.changes else None,
-            found_after_s=self.first_right_s,
         )
 
 
@@ -185,6 +142,5 @@ def _range_score(x_m: float, errors: list[tuple[float, float]]) -> RangeScore:
         lines=len(e),
         error_median_m=float(np.median(np.abs(e))),
         error_p95_m=float(np.quantile(np.abs(e), 0.95)),
-        bias_m=float(np.median(e)),
         within_2_sigma=float(np.mean(np.abs(e) < 2.0 * sigma)),
     )

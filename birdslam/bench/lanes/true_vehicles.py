@@ -1,4 +1,4 @@
-"""In which lane the vehicles of a rendered drive are, and the gap to the leader, against the truth."""
+"""The lanes of the vehicles of a rendered drive against the truth."""
 
 from __future__ import annotations
 
@@ -6,20 +6,18 @@ import math
 from collections.abc import Sequence
 
 import msgspec
-import numpy as np
 
-from birdslam.bench.figures import mean, median
+from birdslam.bench.figures import mean
 from birdslam.bench.lanes.true_lines import KERB, ego_bounds, y_at
 from birdslam.geometry.se2 import SE2
 from birdslam.sources.shipped_drive import TrueBody, TrueLine
-from birdslam.types import Estimate, VehicleLane
+from birdslam.types import Estimate
 
 # From an estimated vehicle to its body, and so much more in a metre of distance: a bearing is known to half a width, a
 # distance to a tenth or two. Alike in all directions, cars 40 m ahead stood for those of the next lane
 ALONG_M, ALONG_REL = 2.0, 0.15
 ACROSS_M, ACROSS_REL = 1.0, 0.02
 PEOPLE = ("pedestrian", "cyclist")  # bodies that are no vehicle's
-MIN_PROBABILITY = 1e-3  # a certain error counts as so much in the log loss
 AGAINST_RAD = math.pi / 2
 DASHED = "dashed"  # of a true line's kinds
 # Wide enough a strip beside a lane for cars to park in it; lanes of one road differ by a few decimetres
@@ -30,13 +28,8 @@ PLACES = ("ego_lane", "left", "right", "oncoming", "off_road")
 class VehiclesReport(msgspec.Struct, frozen=True, kw_only=True):
     """Vehicles in lanes, over all frames of a drive."""
 
-    vehicles: int  # estimates of vehicles that stand for a body whose lane is known
+    vehicles: int  # estimates that belong to a body whose lane is known
     right: float | None = None  # share whose likeliest place is the true one
-    log_loss: float | None = None  # mean of -log of the true place's probability
-    leaders: int = 0  # frames with a true leader that is tracked
-    leader_right: float | None = None  # share in which it is the one that was named
-    gap_error_median_m: float | None = None  # of its gap
-    gap_error_p95_m: float | None = None
 
 
 class VehicleScores:
@@ -44,58 +37,22 @@ class VehicleScores:
 
     def __init__(self) -> None:
         self._right: list[bool] = []
-        self._losses: list[float] = []
-        self._leaders: list[bool] = []
-        self._gaps: list[float] = []
 
     def add(self, estimate: Estimate, bodies: Sequence[TrueBody], truth: tuple[TrueLine, ...]) -> None:
-        """One frame."""
-        lanes = estimate.lanes
-        if lanes is None or not lanes.vehicles:
+        """Adds a frame."""
+        if estimate.lanes is None:
             return
         T_ego_world = estimate.T_world_ego.inverse()
         poses = {v.vehicle: T_ego_world @ v.T_world_vehicle for v in estimate.vehicles}
-        body_of: dict[int, TrueBody] = {}
-        for place in lanes.vehicles:
+        for place in estimate.lanes.vehicles:
             body = _nearest(poses[place.vehicle], bodies) if place.vehicle in poses else None  # people have lanes, too
-            if body is None:
-                continue
-            body_of[place.vehicle] = body
-            where = true_place(body, truth)
+            where = None if body is None else true_place(body, truth)
             if where is not None:
-                self._add_place(place, where)
-        self._add_leader(estimate, body_of, bodies, truth)
-
-    def _add_place(self, place: VehicleLane, where: str) -> None:
-        shares = {name: getattr(place, name) for name in PLACES}
-        self._right.append(max(shares, key=lambda name: shares[name]) == where)
-        self._losses.append(-math.log(max(shares[where], MIN_PROBABILITY)))
-
-    def _add_leader(
-        self, estimate: Estimate, body_of: dict[int, TrueBody], bodies: Sequence[TrueBody], truth: tuple[TrueLine, ...]
-    ) -> None:
-        ahead = [b for b in bodies if b.T_ego_body.x_m > 0.5 * b.length_m and true_place(b, truth) == "ego_lane"]
-        leader = min(ahead, key=lambda b: b.T_ego_body.x_m, default=None)
-        if leader is None or all(body.body != leader.body for body in body_of.values()):
-            return
-        assert estimate.lanes is not None
-        named = estimate.lanes.leader
-        found = None if named is None else body_of.get(named.vehicle)
-        self._leaders.append(found is not None and found.body == leader.body)
-        if named is not None and self._leaders[-1]:
-            self._gaps.append(abs(named.gap_m - (leader.T_ego_body.x_m - 0.5 * leader.length_m)))
+                self._right.append(max(PLACES, key=lambda name, of=place: getattr(of, name)) == where)  # type: ignore[misc]
 
     def report(self) -> VehiclesReport:
-        """What was collected."""
-        return VehiclesReport(
-            vehicles=len(self._right),
-            right=mean(self._right),
-            log_loss=mean(self._losses),
-            leaders=len(self._leaders),
-            leader_right=mean(self._leaders),
-            gap_error_median_m=median(self._gaps),
-            gap_error_p95_m=float(np.quantile(self._gaps, 0.95)) if self._gaps else None,
-        )
+        """Returns the scores of all frames."""
+        return VehiclesReport(vehicles=len(self._right), right=mean(self._right))
 
 
 def _nearest(pose: SE2, bodies: Sequence[TrueBody]) -> TrueBody | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import msgspec
@@ -63,7 +63,7 @@ def idea_variants() -> dict[str, Method]:
         "nothing (the paper)": PAPER,
         "gates on outliers": replace(PAPER, graph=msgspec.structs.replace(PAPER.graph, **gates)),
         "measured covariances": replace(PAPER, weights=WeightsConfig(leave_out=())),
-        "the smoother": Final("", PAPER, SmootherConfig()),
+        "the smoother": Final(PAPER, SmootherConfig()),
     }
 
 
@@ -72,13 +72,13 @@ def placed_variants(base: Live) -> dict[str, Method]:
     return {
         "vehicles placed by measured ground and size": PAPER,
         "all, live": base,
-        "all, final": Final("", base, SmootherConfig()),
+        "all, final": Final(base, SmootherConfig()),
     }
 
 
 def lane_variants() -> dict[str, Method]:
     """Table 5: the batch before and after lane constraints."""
-    return {"before_lanes": _BatchWithoutLanes("Batch SE(3) before lane constraints"), "after_lanes": batch_se3}
+    return {"before_lanes": _BatchWithoutLanes(), "after_lanes": batch_se3}
 
 
 def depth_of(method: Method) -> float:
@@ -89,8 +89,6 @@ def depth_of(method: Method) -> float:
 
 @dataclass(frozen=True)
 class _BatchWithoutLanes:
-    label: str = field(compare=False)
-
     def run(self, log: Sequence[Measurements], camera: Camera) -> Trajectories:
         return batch_se3.run(log, camera, lanes=False)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import msgspec
 import numpy as np
@@ -51,7 +51,6 @@ def inflated(edge: LandmarkEdge, factor: float) -> LandmarkEdge:
 class Live:
     """Our incremental pose graph: the live estimate of each frame, which knows nothing of later ones."""
 
-    label: str = field(compare=False)
     weights: WeightsConfig
     graph: GraphConfig
     cv_inflation: float = 1.0  # of the variances in the log
@@ -80,7 +79,6 @@ class Final:
     A batch, and the paper's graph, which keeps every pose, estimate each frame from the whole log: so does this.
     """
 
-    label: str = field(compare=False)
     live: Live
     smoother: SmootherConfig
 
@@ -99,21 +97,21 @@ class Final:
         return out
 
 
-PAPER = Live("BirdSLAM as published", AS_PUBLISHED.weights, AS_PUBLISHED.graph)
+PAPER = Live(AS_PUBLISHED.weights, AS_PUBLISHED.graph)
 
 
 def ours(config: SlamConfig) -> Live:
     """The method as configured: what a planner gets."""
-    return Live("BirdSLAM (this system), live", config.weights, config.graph)
+    return Live(config.weights, config.graph)
 
 
 def methods(config: SlamConfig) -> dict[str, Method]:
     """Every method by its name; `config` is that of `birdslam`."""
     return {
-        "birdslam": Final("BirdSLAM (this system)", ours(config), SmootherConfig()),
+        "birdslam": Final(ours(config), SmootherConfig()),
         "birdslam_live": ours(config),
         "paper": PAPER,
-        "paper_final": Final("BirdSLAM as published, our smoother", PAPER, SmootherConfig()),
+        "paper_final": Final(PAPER, SmootherConfig()),
         "batch_se3": batch_se3,
         "nair": nair,
         "namdev": namdev,

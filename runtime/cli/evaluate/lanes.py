@@ -24,8 +24,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text += "lines: DRIVE is a rendered drive with true lines, demo:DIR; "
     text += "paint: DIR has imgs/NAME.png and masks/NAME.png of lane markings, as in comma10k"
     parser.add_argument("--truth", choices=(KITTI_ROAD, LINES, PAINT), help=text)
-    text = "camera height above the road, with --truth kitti-road"
-    parser.add_argument("--height", type=float, metavar="M", help=text)
     add_config(parser)
     add_pipeline(parser)
 
@@ -42,10 +40,10 @@ def run(options: argparse.Namespace) -> int:
     if options.truth is None:
         print(draw_frame_lanes(configuration, options.drive, options.frame))
         return 0
-    report = evaluate_stills(configuration, Path(options.drive), options.height)
+    report = evaluate_stills(configuration, Path(options.drive))
     for found in report.by_image:
         width = "no lane" if found.width_m is None else f"{found.width_m:.2f} m between {found.left} and {found.right}"
-        print(f"{found.image:16} IoU {found.ego_lane_iou:.3f}, in the image {found.ego_lane_iou_image:.3f}: {width}")
+        print(f"{found.image:16} IoU {found.ego_lane_iou:.3f}: {width}")
     print(f"{report.images} images: mean IoU of the ego lane {report.ego_lane_iou_mean:.3f}")
     print(Path(configuration.output) / REPORT)
     return 0
@@ -72,23 +70,15 @@ def _text(report: DriveReport) -> str:
     out = [f"{lines.drive}: {lines.frames} frames"]
     out += [
         f"  {at.ahead_m:4.0f} m ahead: error {at.error_median_m:.3f} m median, {at.error_p95_m:.3f} m p95, "
-        f"bias {at.bias_m:+.3f} m, {at.within_2_sigma:.0%} within 2 sigma, {at.lines} lines"
+        f"{at.within_2_sigma:.0%} within 2 sigma, {at.lines} lines"
         for at in lines.ranges
         if at.error_median_m is not None
     ]
     values = {
-        "heading error": (lines.heading_error_median_deg, "{:.2f} deg"),
         "width error": (lines.width_error_rel, "{:+.1%}"),
         "recall of lines": (lines.recall, "{:.0%}"),
-        "false lines per km": (lines.false_lines_per_km, "{:.1f}"),
-        "frames with an ego lane": (lines.ego_lane_share, "{:.1%}"),
         "wrong ego lane": (lines.ego_lane_wrong, "{:.1%}"),
-        "jitter": (lines.jitter_m, "{:.3f} m"),
-        "time to detection": (lines.found_after_s, "{:.2f} s"),
         "vehicles in the true lane": (vehicles.right, "{:.1%} of " + str(vehicles.vehicles)),
-        "log loss": (vehicles.log_loss, "{:.3f}"),
-        "true leader": (vehicles.leader_right, "{:.1%} of " + str(vehicles.leaders)),
-        "gap error": (vehicles.gap_error_median_m, "{:.2f} m median"),
     }
     out += [f"  {name}: {form.format(value)}" for name, (value, form) in values.items() if value is not None]
     return "\n".join(out)

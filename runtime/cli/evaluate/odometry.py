@@ -79,7 +79,6 @@ def _table(reports: Sequence[OdometryReport]) -> str:
         ("RPE m", "rpe_t_m", 4),
         ("RPE deg", "rpe_r_deg", 4),
         ("segments %", "segment_t_pct", 2),
-        ("still m", "standing_drift_m", 3),
         ("10 m NEES", "motion.nees", 2),
     )
     lines = [f"{'sequence':16}" + "".join(f"{title:>12}" for title, _, _ in columns)]

@@ -11,7 +11,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from birdslam.bench.baselines.batch_se2 import landmark_key
+from birdslam.bench.baselines.posegraph3 import landmark_key
 from birdslam.types import LandmarkEdge, Measurements
 
 _PRIOR = gtsam.noiseModel.Isotropic.Sigma(3, 1e-3)

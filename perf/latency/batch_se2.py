@@ -14,16 +14,14 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 
+from birdslam.bench.baselines.posegraph3 import landmark_key
 from birdslam.bench.baselines.trajectories import Trajectories, dead_reckoned
 from birdslam.geometry.arrays import Floats
-from birdslam.geometry.camera import Camera
 from birdslam.geometry.planar import between, compose, log
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.weights import WeightsConfig, weighted
 from birdslam.types import LandmarkEdge, LandmarkKind, Measurements, VehicleEdge
-
-label = "Batch SE(2), same edges"
 
 _SIGMA_START = 1e-7  # of the first pose (m, rad), which is the world
 _SIGMA_RESTART = 1.0  # of a pose that no edge ties to an earlier one
@@ -31,11 +29,6 @@ _SIGMA_FREE_RAD = 1e3  # a landmark has no yaw
 _ITERATIONS = 50
 _TOLERANCE = 1e-12
 _STEP = 1e-5  # for derivatives
-
-
-def run(log: Sequence[Measurements], camera: Camera) -> Trajectories:
-    """Trajectories of the whole log at once, with the default weights."""
-    return solve(log, GraphConfig(), WeightsConfig()).trajectories()
 
 
 @dataclass(frozen=True)
@@ -54,14 +47,6 @@ class Solution:
     def vehicle(self, vehicle: int, frame: int) -> SE2:
         """T_world_vehicle."""
         return self._pose(vehicle_key(vehicle, frame))
-
-    def trajectories(self) -> Trajectories:
-        """All of it."""
-        out = Trajectories(ego={frame: self.ego(frame) for frame in self.frames})
-        for vehicle, frames in self.vehicles.items():
-            for frame in frames:
-                out.put_vehicle(vehicle, frame, self.vehicle(vehicle, frame))
-        return out
 
     def _pose(self, key: int) -> SE2:
         pose = self.values.atPose2(key)
@@ -93,11 +78,6 @@ def ego_key(frame: int) -> int:
 def vehicle_key(vehicle: int, frame: int) -> int:
     """Of a vehicle's pose in a frame."""
     return int(gtsam.symbol("v", vehicle * 10_000_000 + frame))
-
-
-def landmark_key(kind: LandmarkKind, landmark: int) -> int:
-    """Of a landmark's place; each kind has ids of its own."""
-    return int(gtsam.symbol("l" if kind is LandmarkKind.ROAD_POINT else "m", landmark))
 
 
 class _Builder:
