@@ -155,7 +155,7 @@ def compare(
             sequence=sequence, frames=len(estimated), path_estimated_m=path_estimated_m, statuses=statuses
         )
     path_m, error_m = path_length_m(truth), ate_m(truth, estimated)
-    return OdometryReport(
+    report = OdometryReport(
         sequence=sequence,
         frames=len(estimated),
         path_m=path_m,
@@ -165,8 +165,8 @@ def compare(
         path_estimated_m=path_estimated_m,
         statuses=statuses,
         segment_t_pct=segment_error_pct(truth, estimated),
-        **(evo_errors(truth, estimated) if has_evo() else {}),
     )
+    return msgspec.structs.replace(report, **evo_errors(truth, estimated)) if has_evo() else report
 
 
 def _check_known(name: str, truth: Floats, compared: slice) -> None:
