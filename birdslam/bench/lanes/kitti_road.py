@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.bench.lanes.paint_masks import read
 from birdslam.geometry import bev
 from birdslam.geometry.arrays import Bools, Floats, Ints
 from birdslam.geometry.camera import Camera, GroundPlane
@@ -78,15 +79,10 @@ def find_pairs(folder: Path) -> list[Pair]:
 
 def read_pair(pair: Pair) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """(H, W, 3) BGR image and mask. Raises DatasetError."""
-    image, mask = (cv2.imread(str(path), cv2.IMREAD_COLOR) for path in (pair.image, pair.mask))
-    for path, read in ((pair.image, image), (pair.mask, mask)):
-        if read is None:
-            raise DatasetError(f"{path}: can't be read as an image")
-    assert image is not None
-    assert mask is not None
+    image, mask = read(pair.image), read(pair.mask)
     if image.shape != mask.shape:
         raise DatasetError(f"{pair.mask}: is of another size than {pair.image.name}")
-    return np.asarray(image, np.uint8), np.asarray(mask, np.uint8)
+    return image, mask
 
 
 def camera_of(image: NDArray[np.uint8], stated: Camera | None) -> Camera:
