@@ -1,6 +1,6 @@
 """The paper's own choices (Sec. 3), as one configuration of the method: what `method = "paper"` stands for.
 
-The rows of the tables that are called *as published* and `birdslam evaluate localisation --mode paper` use it too.
+The rows of the tables that are called *as published* and `--set method=paper` use it too.
 Where the paper states no number, the default stands.
 """
 
