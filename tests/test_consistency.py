@@ -112,16 +112,18 @@ def test_the_batch_recovers_a_world_without_noise() -> None:
     world = drive(DriveConfig(frames=30, vehicles=2, landmarks=6, lane_points=0, noise=0.0), seed=4)
     for weights in (ALL_EDGES, WeightsConfig(mode="paper")):
         batch: Solution = solve(world.measurements, GraphConfig(constant_velocity=False), weights)
-        found = batch.trajectories()
-        for frame, pose in found.ego.items():
-            np.testing.assert_allclose(off(pose, world.ego[frame]), 0.0, atol=1e-6)
-        for vehicle, poses in found.vehicles.items():
-            for frame, pose in poses.items():
+        assert len(batch.frames) == 30
+        assert len(batch.vehicles) == 2
+        for frame in batch.frames:
+            np.testing.assert_allclose(off(batch.ego(frame), world.ego[frame]), 0.0, atol=1e-6)
+        for vehicle, frames in batch.vehicles.items():
+            for frame in frames:
+                pose = batch.vehicle(vehicle, frame)
                 np.testing.assert_allclose(off(pose, world.vehicles[vehicle][frame]), 0.0, atol=1e-6)
 
 
 def test_a_batch_of_nothing_is_nothing() -> None:
-    assert solve([], GraphConfig(), WeightsConfig()).trajectories().ego == {}
+    assert solve([], GraphConfig(), WeightsConfig()).frames == []
 
 
 # --- a vague yaw ---
