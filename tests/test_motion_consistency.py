@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from birdslam.bench.ego import truth_quality
-from birdslam.bench.ego.motion_consistency import MotionConsistency, Motions
+from birdslam.bench.ego.motion_consistency import MotionConsistency, Motions, Nees
 from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.trajectory import ego_pose, inverse, mount_pose
@@ -66,9 +66,12 @@ def test_a_consistent_covariance_has_a_nees_of_one(factor: float, seed: int) -> 
     true, L = town(200, rng), np.linalg.cholesky(COV)
     erring = [step @ SE2.exp(L @ rng.standard_normal(3)) for step in true]
     report = judged(told(erring, factor**2 * COV), drive(true))
-    assert report.n > 50
-    assert report.nees is not None
-    assert 0.2 / factor**2 < report.nees < 1.5 / factor**2  # less than 1, by the noise of the axes of the truth
+    for nees in (report.frame, report.stretch):
+        assert nees.n > 50
+        assert nees.mean is not None
+        assert nees.median is not None
+        assert 0.2 / factor**2 < nees.mean < 1.5 / factor**2  # less than 1, by the noise of the axes of the truth
+        assert 0.1 / factor**2 < nees.median < 1.5 / factor**2
 
 
 def test_the_noise_of_the_truth_is_measured() -> None:
@@ -83,7 +86,9 @@ def test_stretches_of_an_interpolated_truth_are_left_out() -> None:
     true = town(120, rng)
     poses = drive([SE2(0.8, 0.0, 0.002)] * 12 + true[12:])
     assert np.flatnonzero(truth_quality.interpolated(poses)).tolist() == list(range(1, 13))
-    assert judged(told(true, COV), poses).n < judged(told(true, COV), drive(true)).n
+    some, all_of_them = judged(told(true, COV), poses), judged(told(true, COV), drive(true))
+    assert some.stretch.n < all_of_them.stretch.n
+    assert some.frame.n == all_of_them.frame.n - 12
     assert judged(told(true, COV), poses).nees == pytest.approx(0.0, abs=0.1)
 
 
@@ -94,8 +99,8 @@ def test_axes_that_are_rotated_against_the_path_count_as_noise_of_the_truth() ->
     small = np.diag([1e-4, 2e-6, 1e-6])
     erring = [step @ SE2.exp(np.sqrt(np.diag(small)) * rng.standard_normal(3)) for step in true]
     report = judged(told(erring, small), drive([rotated.inverse() @ step @ rotated for step in true]))
-    assert report.nees is not None
-    assert 0.5 < report.nees < 3.0
+    assert report.stretch.mean is not None
+    assert 0.5 < report.stretch.mean < 3.0
 
 
 def test_a_standing_cars_truth_is_no_interpolation() -> None:
@@ -112,8 +117,8 @@ def test_a_step_that_no_car_makes_is_found_at_both_its_ends() -> None:
     assert not truth_quality.implausible(drive(steps), t_ns).any()
 
 
-def test_what_is_invalid_coasts_or_stands_is_not_judged() -> None:
-    steps = [SE2(1.0, 0.0, 0.0)] * 8
+def test_only_valid_measured_motions_of_a_moving_car_are_judged() -> None:
+    steps = town(8, np.random.default_rng(1))
     motions = Motions(MOUNT)
     status = {3: Status.SCALE_INVALID, 4: Status.ODOMETRY_COASTING, 5: Status.STANDSTILL}
     for frame, step in enumerate([None, *steps]):
@@ -121,12 +126,14 @@ def test_what_is_invalid_coasts_or_stands_is_not_judged() -> None:
         motions.add(measurements(frame, off, COV, status=(status[frame],) if frame in status else ()))
     motions.add(measurements(9, SE2(9.0, 0.0, 0.0), COV, status=(Status.END_OF_SOURCE,)))
     report = judged(motions, drive(steps))
-    assert report.n == 0
+    assert report.frame.n == 5
+    assert report.frame.mean == pytest.approx(0.0, abs=1e-9)
+    assert report.stretch == Nees(n=0)
 
 
 def test_a_recording_of_one_frame_has_no_figures() -> None:
     report = judged(told([], COV), drive([]))
-    assert (report.n, report.nees) == (0, None)
+    assert report == MotionConsistency(frame=Nees(n=0), stretch=Nees(n=0))
 
 
 def test_without_measurements_there_is_nothing_to_judge() -> None:

@@ -1,4 +1,4 @@
-"""The consistency of the covariance of the ego's motion: NEES (Bar-Shalom et al. 2001, 5.4) of 10 m of CC edges.
+"""The consistency of the covariance of the ego's motion: NEES (Bar-Shalom et al. 2001, 5.4) of CC edges and 10 m.
 
 Relative motions are used since the first, interpolated poses of KITTI would dominate the error of a pose in the world.
 The pose graph chains the edges of each stretch. The noise of the truth (`truth_quality.py`) is added to the covariance,
@@ -6,6 +6,8 @@ and stretches with an interpolated truth are left out.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import msgspec
 import numpy as np
@@ -21,14 +23,23 @@ from birdslam.trajectory import Transform, inverse, mount_pose, split_pose
 from birdslam.types import INVALIDATING, EgoEdge, Estimate, Measurements, Status
 
 DIMENSIONS = 3
+MEDIAN = 2.366  # of the chi-square distribution with DIMENSIONS degrees of freedom
 STRETCH_M = 10.0
 
 
-class MotionConsistency(msgspec.Struct, frozen=True, kw_only=True):
-    """The consistency over the stretches of one sequence."""
+class Nees(msgspec.Struct, frozen=True, kw_only=True):
+    """e' P^-1 e over its value for a consistent covariance: 1 is consistent, more is overconfident."""
 
     n: int
-    nees: float | None = None  # mean of e' P^-1 e over its degrees of freedom: 1 is consistent, more is overconfident
+    mean: float | None = None
+    median: float | None = None  # outliers of the truth do not count
+
+
+class MotionConsistency(msgspec.Struct, frozen=True, kw_only=True):
+    """The consistency of the motions of one sequence."""
+
+    frame: Nees  # of each CC edge of a moving car
+    stretch: Nees  # of STRETCH_M
 
 
 class Motions:
@@ -57,18 +68,32 @@ class Motions:
         """
         if len(self._index) != len(truth):
             return None
+        edges = [
+            (first, last, cc.T_from_to, cc.cov)
+            for last, (first, cc, measurements) in self._moved.items()
+            if Status.STANDSTILL not in measurements.status
+        ]
+        stretches = [(first, last, end.T_world_ego, end.cov) for first, last, end in self._stretches(truth)]
+        return MotionConsistency(frame=self._nees(edges, truth), stretch=self._nees(stretches, truth))
+
+    def _nees(self, motions: Sequence[tuple[int, int, SE2, Sequence[float]]], truth: Transform) -> Nees:
+        """Judges motions (first frame, last frame, T_first_last, its covariance)."""
         mount, interpolated = mount_pose(self._mount), truth_quality.interpolated(truth)
         noise = np.diag(truth_quality.step_noise(truth, self._mount) ** 2)
         squares = []
-        for first, last, end in self._stretches(truth):
+        for first, last, T_first_last, cov in motions:
             if interpolated[first + 1 : last + 1].any():
                 continue
             goal, _ = split_pose(mount @ inverse(truth[first]) @ truth[last] @ inverse(mount))
-            error = end.T_world_ego.between(goal).log()
-            aside = moved_by_turn(end.T_world_ego) * truth_quality.AXES_SIGMA_RAD
-            cov = np.reshape(end.cov, (DIMENSIONS, DIMENSIONS)) + noise + np.outer(aside, aside)
-            squares.append(float(error @ np.linalg.solve(cov, error)))
-        return MotionConsistency(n=len(squares), nees=float(np.mean(squares)) / DIMENSIONS if squares else None)
+            error = T_first_last.between(goal).log()
+            aside = moved_by_turn(T_first_last) * truth_quality.AXES_SIGMA_RAD
+            total = np.reshape(cov, (DIMENSIONS, DIMENSIONS)) + noise + np.outer(aside, aside)
+            squares.append(float(error @ np.linalg.solve(total, error)))
+        if not squares:
+            return Nees(n=0)
+        return Nees(
+            n=len(squares), mean=float(np.mean(squares)) / DIMENSIONS, median=float(np.median(squares)) / MEDIAN
+        )
 
     def _stretches(self, truth: Transform) -> list[tuple[int, int, Estimate]]:
         """Returns (first, last, motion) of each STRETCH_M of the true path, starting every quarter of it.

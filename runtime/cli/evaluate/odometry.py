@@ -79,7 +79,10 @@ def _table(reports: Sequence[OdometryReport]) -> str:
         ("RPE m", "rpe_t_m", 4),
         ("RPE deg", "rpe_r_deg", 4),
         ("segments %", "segment_t_pct", 2),
-        ("10 m NEES", "motion.nees", 2),
+        ("frame NEES", "motion.frame.mean", 2),
+        ("median", "motion.frame.median", 2),
+        ("10 m NEES", "motion.stretch.mean", 2),
+        ("median", "motion.stretch.median", 2),
     )
     lines = [f"{'sequence':16}" + "".join(f"{title:>12}" for title, _, _ in columns)]
     for report in reports:
@@ -90,7 +93,7 @@ def _table(reports: Sequence[OdometryReport]) -> str:
 
 
 def _field(report: Any, name: str) -> float | None:
-    """Returns a field or a nested field of a report, as in `motion.nees`; None if it is missing."""
+    """Returns a field or a nested field of a report, as in `motion.frame.mean`; None if it is missing."""
     for part in name.split("."):
         report = None if report is None else getattr(report, part)
     return cast("float | None", report)
