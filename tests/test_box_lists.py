@@ -128,7 +128,7 @@ def test_every_way_of_writing_a_box_gives_the_same(tmp_path: Path) -> None:
         (LIST, {"boxes": np.zeros((1, 5, 7))}, r"detector.boxes.*\(1, N, 6\)"),
         (LIST + 'layout = "channels"\n', {"boxes": np.zeros((1, 7, 5))}, r"detector.boxes.*\(1, 6, N\)"),
         (LIST + 'scores = "s"\n', {"boxes": np.zeros((1, 5, 4)), "s": np.zeros((1, 6, 2))}, "as many as boxes has"),
-        (LIST.replace("0 = ", "2 = "), {"boxes": np.zeros((1, 5, 6))}, "there is no class 2 among 2"),
+        (LIST.replace("0 = ", "2 = "), {"boxes": np.zeros((1, 5, 6))}, "class 2 is not one of 2"),
     ],
 )
 def test_a_manifest_that_does_not_fit_is_refused(tmp_path: Path, text: str, answers: Numbers, said: str) -> None:

@@ -118,7 +118,7 @@ def test_a_network_of_another_shape_is_refused(
 
 
 def test_a_class_without_a_channel_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ModelError, match="there is no class 3 among 3"):
+    with pytest.raises(ModelError, match="class 3 is not one of 3"):
         load(tmp_path, MANIFEST.replace("2 = ", "3 = "), maps([]))
 
 

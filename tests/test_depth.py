@@ -77,7 +77,10 @@ def test_the_padding_is_cut_away(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "named"),
     [
-        (DISPARITY + "min_depth_m = 5.0\nmax_depth_m = 2.0\n", "max_depth_m: 2.0 is not over min_depth_m = 5.0"),
+        (
+            DISPARITY + "min_depth_m = 5.0\nmax_depth_m = 2.0\n",
+            "max_depth_m = 2.0 must be larger than min_depth_m",
+        ),
         (DISPARITY + "max_depth_m = inf\n", "max_depth_m"),
         (METRIC + "metres_per_unit = inf\n", "metres_per_unit"),
         (METRIC + "sigma_rel = 0.0\n", "sigma_rel"),

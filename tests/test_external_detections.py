@@ -145,7 +145,7 @@ def test_only_filters_ids_along_with_boxes() -> None:
         ([[0, 0, np.nan, 9]], ["car"], None, None, "finite"),
         ([[9, 0, 0, 9]], ["car"], None, None, "x1 <= x2"),
         ([[0, 0, 9, 9]], ["car"], [1.5], None, r"in \[0, 1\]"),
-        ([[0, 0, 9, 9]] * 2, ["car"] * 2, None, [4, 4], "each once"),
+        ([[0, 0, 9, 9]] * 2, ["car"] * 2, None, [4, 4], "unique"),
         ([[0, 0, 9, 9]], ["car"], None, [0.5], "integers"),
     ],
 )

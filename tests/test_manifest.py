@@ -98,14 +98,14 @@ BAD_TEXTS = [
     (SEGMENTER.replace('"RGB"', '"RBG"'), "RBG"),
     (SEGMENTER.replace("width_px = 32", ""), "width_px"),
     (SEGMENTER.replace("width_px = 32", "width_px = '32'"), "width_px"),
-    (SEGMENTER.replace("channel = 1", "channel = 3"), "channel: there is no channel 3 among 3"),
+    (SEGMENTER.replace("channel = 1", "channel = 3"), "channel: 3 is not one of 3 channels"),
     (SEGMENTER.replace("channels = 3", "channels = 3\nthreshold = 0.5"), 'only with rule = "above"'),
     (SEGMENTER.replace('role = "segmenter"', 'role = "detector"'), "role: a detector needs the table [detector]"),
     (SEGMENTER + "[tiles]\ncolumns = 2\n", "tiles: a segmenter can't run on tiles"),
     (SEGMENTER.replace("[segmenter]", "[segmenter"), "line"),
     (SEGMENTER.replace('"RGB"', '"RGB"\nstd = [1, 0, 1]'), "std must be positive"),
     (SEGMENTER.replace('"RGB"', '"RGB"\nscale = nan'), "finite"),
-    (DETECTOR + '7 = "bus"\n', "labels: there is no class 7 among 2 classes"),
+    (DETECTOR + '7 = "bus"\n', "labels: class 7 is not one of 2 classes"),
     (DETECTOR.replace('"car"', '"cra"'), "cra"),
 ]
 
@@ -127,7 +127,7 @@ def test_files_that_are_none(tmp_path: Path) -> None:
     torn.write_bytes(whole.read_bytes()[:-20])
     for content in (torn.read_bytes(), b"", b"no network"):
         torn.write_bytes(content)
-        assert f"{torn}: no network that onnxruntime can run" in refusal(write(torn, SEGMENTER))
+        assert f"{torn}: onnxruntime can't run this network" in refusal(write(torn, SEGMENTER))
     (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
     assert "binary.toml" in refusal(ModelSpec(str(whole), manifest=str(tmp_path / "binary.toml")))
 

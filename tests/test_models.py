@@ -196,7 +196,7 @@ def test_weights_in_another_file_are_refused_before_anything_is_read(
     network = segmenter(tmp_path)
     assert not has_weights_elsewhere(network.read_bytes())
     assert has_weights_elsewhere(with_external_data(network, inside_subgraph))
-    assert "its weights lie in another file" in refused(capsys, "add", str(network))
+    assert "its weights are in another file" in refused(capsys, "add", str(network))
     assert left_in(store) == set()
 
 
@@ -313,7 +313,7 @@ def test_check_takes_a_network_a_manifest_or_a_name(
         assert "fits its manifest" in out
         assert "output (1, 3, 16, 32)" in out
         assert sha256(network) in out
-    assert "there is no channel 5" in _of_manifest(network, capsys, SEGMENTER.replace("channel = 1", "channel = 5"))
+    assert "channel: 5 is not one of" in _of_manifest(network, capsys, SEGMENTER.replace("channel = 1", "channel = 5"))
     assert "input.width_px" in _of_manifest(network, capsys, SEGMENTER.replace("width_px = 32", "width_px = 64"))
     network.unlink()
     assert "can't be read" in refused(capsys, "check", str(network.with_suffix(".toml")))

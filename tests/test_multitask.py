@@ -19,7 +19,7 @@ from birdslam.geometry.se2 import SE2
 from birdslam.perception import Detections, Findings, ModelSpec, Networks, Segmentation, load_network
 from birdslam.perception.decoding.multitask import (
     BODY_CHANNELS,
-    CANONICAL_FOCAL,
+    CANONICAL_FOCAL_REL,
     CLASSES,
     KINDS,
     MEAN_SIZE_M,
@@ -220,7 +220,7 @@ def test_canonical_depth_is_metric_for_every_camera(focal: float) -> None:
     frame = world(cam)
     found = read(perfect_answer(encode(frame, WHOLE, WIDTH, HEIGHT, TargetsConfig())))
     assert found.depth is not None
-    assert found.depth.canonical_focal_rel == pytest.approx(CANONICAL_FOCAL)
+    assert found.depth.canonical_focal_rel == pytest.approx(CANONICAL_FOCAL_REL)
     upper, lower = 1.0 / frame.depth_m[::2, ::2], 1.0 / frame.depth_m[1::2, 1::2]
     nearness = 0.5 * (upper + lower)  # of a plane at the corner where four pixels meet
     near = nearness > 1.0 / 30.0
@@ -299,7 +299,7 @@ def test_padding_is_part_of_the_focal_length() -> None:
         perfect_answer(encode(world(camera()), WHOLE, WIDTH, HEIGHT, TargetsConfig())), view
     )
     assert found.depth is not None
-    assert found.depth.canonical_focal_rel == pytest.approx(2.0 * CANONICAL_FOCAL)
+    assert found.depth.canonical_focal_rel == pytest.approx(2.0 * CANONICAL_FOCAL_REL)
     assert found.depth.depth_m.shape == (HEIGHT // 2, WIDTH // 4)
 
 

@@ -150,7 +150,7 @@ def test_a_network_without_numbers_says_so(tmp_path: Path) -> None:
         (('[points]\nname = "points"', '[points]\nname = "cloud"'), "points.name"),
         (('output = "body"', 'output = "other"'), "other"),
         (("count = 64", "count = 8"), "count"),
-        (('features = ["x", "y", "z", "u", "v", "log_depth"]', 'features = ["x", "x", "z"]'), "each once"),
+        (('features = ["x", "y", "z", "u", "v", "log_depth"]', 'features = ["x", "x", "z"]'), "distinct"),
         (("count = 64", 'count = 64\nclass_name = "c"'), "class_name"),
         (('role = "pointnet"', 'role = "detector"'), "role"),
         (("mean_m = [4.0, 2.0, 1.5]", "mean_m = [4.0, 0.0, 1.5]"), "mean_m"),

@@ -125,7 +125,7 @@ def test_auto_takes_what_wins_and_agrees(monkeypatch: pytest.MonkeyPatch) -> Non
         (Measured(6.0, 0.001), "openvino"),
         (Measured(6.0, 0.3), "cpu"),  # it computes something else
         (Measured(9.9, 0.0), "cpu"),  # no gain
-        (Measured(float("inf"), float("inf"), "does not begin"), "cpu"),
+        (Measured(float("inf"), float("inf"), "does not start"), "cpu"),
     ):
         figures(monkeypatch, cpu=cpu, openvino=openvino)
         assert chosen("multitask", SHIPPED, "auto", ("cpu", "openvino")).provider == wanted
@@ -183,5 +183,5 @@ def test_an_accelerator_whose_libraries_are_missing_gives_way_to_the_cpu(monkeyp
     fallen = load_network("multitask", by("tensorrt"))
     assert (fallen.provider, fallen.fell_back) == (
         "cpu",
-        "tensorrt: tensorrt does not begin: Please install TensorRT libraries",
+        "tensorrt: tensorrt does not start: Please install TensorRT libraries",
     )

@@ -51,8 +51,8 @@ def test_logits_are_held_against_a_probability(tmp_path: Path) -> None:
     [
         ("[]", "", "channel: a channel, or a list"),
         ("[1, 1]", "", "channel: a channel, or a list"),
-        ("[0, 4]", "", "there is no channel 4 among 4"),
-        ("-1", "", "there is no channel -1"),
+        ("[0, 4]", "", "4 is not one of 4 channels"),
+        ("-1", "", "-1 is not one of"),
         ("[0, 1, 2, 3]", "", "argmax"),
         ("0", "sigmoid = true", "sigmoid: only with rule"),
         ("0", 'rule = "above"\nsigmoid = true\nthreshold = 1.0', "sigmoid: only with rule"),

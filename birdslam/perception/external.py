@@ -23,12 +23,12 @@ def external_detections(
     detector: Family | EdgeSigma = "unknown",
     lower_edge: LowerEdge = "body",
 ) -> Detections:
-    """Boxes (N, 4) x1, y1, x2, y2 in px with a label each, for `BirdSLAM.step`; they keep their order.
+    """Boxes (N, 4) x1, y1, x2, y2 in px with a label each, for `BirdSLAM.step`, in the given order.
 
-    `scores` (N,) in [0, 1], 1 where left out. `track_ids` (N,) are another tracker's, which are kept; a negative one is
-    of no track yet. `distorted`: the boxes were drawn on this camera's images as they come, not on undistorted ones.
-    `detector` is its family, which says how sure edges are (families.py), or that 1-sigma where it was measured. Raises
-    ValueError for invalid numbers and for an unknown family.
+    `scores` (N,) in [0, 1] default to 1. `track_ids` (N,) come from an external tracker and are kept; a negative id
+    means no track. `distorted` is the camera whose raw images the boxes refer to; None: undistorted images. `detector`
+    is its family, which gives the sigmas of the edges (families.py), or measured sigmas. Raises ValueError for invalid
+    numbers and for an unknown family.
     """
     boxes = np.asarray(boxes_px, np.float64).reshape(-1, 4) if np.size(boxes_px) else np.zeros((0, 4))
     count = len(boxes)
@@ -42,13 +42,13 @@ def external_detections(
         if found != count:
             raise ValueError(f"{name}: {found} for {count} boxes")
     if not (np.isfinite(boxes).all() and (boxes[:, :2] <= boxes[:, 2:]).all()):
-        raise ValueError("boxes need to be finite, with x1 <= x2 and y1 <= y2")
+        raise ValueError("boxes must be finite, with x1 <= x2 and y1 <= y2")
     if not ((sure >= 0.0) & (sure <= 1.0)).all():
-        raise ValueError("scores need to be in [0, 1]")
+        raise ValueError("scores must be in [0, 1]")
     if ids is not None:
         known = ids[ids >= 0]
         if not np.issubdtype(ids.dtype, np.integer) or len(np.unique(known)) < len(known):
-            raise ValueError("track_ids need to be integers, each once in an image")
+            raise ValueError("track_ids must be integers, unique in an image")
         ids = ids.astype(np.int64)
     if distorted is not None:
         boxes = undistort_boxes(distorted, boxes)
@@ -57,7 +57,7 @@ def external_detections(
 
 
 def undistort_boxes(camera: Camera, boxes_px: Floats) -> Floats:
-    """Moves boxes (N, 4) from the camera's raw images to undistorted ones, by the middles of their sides."""
+    """Undistorts boxes (N, 4) of the camera's raw images, by the midpoints of their sides."""
     if not (camera.distortion and len(boxes_px)):
         return boxes_px
     x1, y1, x2, y2 = boxes_px.T

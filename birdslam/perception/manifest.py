@@ -11,8 +11,8 @@ from typing import Annotated, Literal, get_args
 
 import msgspec
 
-SHIPPED_NETWORKS = Path(__file__).parent / "shipped"  # each with its manifest beside it, but that of lane grids
-SHIPPED_MULTITASK = "multitask_int8.onnx"  # as good as the fp32 one in half the time; `--model multitask` is that
+SHIPPED_NETWORKS = Path(__file__).parent / "shipped"  # with their manifests; the lane-grid network has none
+SHIPPED_MULTITASK = "multitask_int8.onnx"  # `--model multitask` selects the fp32 network
 
 Role = Literal["detector", "segmenter", "depth", "multitask"]
 Label = Literal["car", "truck", "bus", "person", "bicycle", "motorcycle"]
@@ -24,27 +24,27 @@ Variance = Annotated[float, msgspec.Meta(gt=0.0, le=10.0)]
 SigmaRel = Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)]
 BiasRel = Annotated[float, msgspec.Meta(ge=-0.3, le=0.3)]
 LowerEdge = Literal["body", "tyres"]  # see DetectorTable
-Scoring = Literal["none", "sigmoid", "softmax"]  # what makes scores in [0, 1] of a detector's numbers
+Scoring = Literal["none", "sigmoid", "softmax"]  # converts a detector's outputs to scores in [0, 1]
 Sha256 = Annotated[str, msgspec.Meta(pattern="^([0-9a-f]{64})?$")]
 
 
 class ModelError(ValueError):
-    """A network or its manifest that can't be used; the message names the file, the key and both sides' statements."""
+    """An unusable network or manifest. The message names the file, the key and both values."""
 
 
 class ManifestMismatch(ValueError):
-    """One key of a manifest that its network contradicts; `load_network` makes a ModelError of it."""
+    """A key of a manifest contradicts the network; `load_network` converts this to a ModelError."""
 
     def __init__(self, key: str, stated: object, has: object) -> None:
         super().__init__(f"{key}: the manifest says {stated}, the network has {has}")
 
 
 class Stretch(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="mode", tag="stretch"):
-    """The image is resized to the input's size whatever its aspect."""
+    """The image is resized to the input's size; its aspect ratio is not kept."""
 
 
 class FitPad(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="mode", tag="fit_pad"):
-    """The image keeps its aspect, fills the input in one direction and is padded in the other."""
+    """The image keeps its aspect ratio, fills the input in one direction and is padded in the other."""
 
     pad_value: Annotated[int, msgspec.Meta(ge=0, le=255)] = 114
     align: Literal["top_left", "centre"] = "top_left"
@@ -53,7 +53,7 @@ class FitPad(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field=
 class Input(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The network's one input, float32, batch 1, three channels: (pixel * scale - mean) / std.
 
-    A grey image is given three times. `mean` and `std` are in the order of `colour`, in units of the scaled pixel.
+    A grey image is repeated in all three channels. `mean` and `std` follow the order of `colour`, in scaled pixels.
     """
 
     name: str
@@ -74,10 +74,10 @@ class Input(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
 
 class Tiles(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A wide image is cut into at most `columns` columns of equal width, each a run of its own.
+    """A wide image is cut into at most `columns` columns of equal width; the network runs once per column.
 
-    Fewer are cut where they already fill the input's aspect: more would cost and not enlarge anything. Neighbours share
-    at least `overlap` of a column's width.
+    Fewer columns are used when they already match the input's aspect ratio: more would not raise the resolution.
+    Neighbouring columns overlap by at least `overlap` of their width.
     """
 
     columns: Annotated[int, msgspec.Meta(ge=1, le=16)]
@@ -85,10 +85,10 @@ class Tiles(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
 
 class BoxSigma(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """1-sigma of each edge of a detector's boxes, as measured against the truth: `rel` of the box's side and `px`.
+    """1-sigma of a detector's box edges: `rel`, a fraction of the box's side, plus `px` of the network's input.
 
-    Pixels are those of the network's input. It says how much Eq. 1 on the bottom of a box is worth. An edge that is
-    named has its own number instead of `rel`; sides are the width for left and right, the height for upper and lower.
+    It sets the covariance of Eq. 1 on the lower edge of a box. A value for a named edge replaces `rel`. The side is the
+    width for the left and right edges, the height for the upper and lower ones.
     """
 
     rel: SigmaRel
@@ -100,10 +100,10 @@ class BoxSigma(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
 
 class DrawnInside(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How far inside of an object's outline a detector draws each edge in the median, as a fraction of the box's side.
+    """Median bias of each edge of a detector's boxes, as a fraction of the box's side; positive is inside the outline.
 
-    Negative: outside of it. Sides are the width for left and right, the height for upper and lower. Every box is
-    corrected by it: Eq. 1 makes too large a depth of a lower edge that is too high.
+    The side is the width for the left and right edges, the height for the upper and lower ones. Every box is corrected:
+    by Eq. 1 a lower edge that is too high gives too large a depth.
     """
 
     left: BiasRel = 0.0
@@ -113,11 +113,11 @@ class DrawnInside(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
 
 class DetectorTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What every detector's table has.
+    """The keys common to all detectors.
 
-    A class without a label in `labels` is not reported. Labels that stand together in `rivals` suppress each other in
-    NMS as if they were one class (one vehicle is not both a car and a truck). `lower_edge` says where boxes of vehicles
-    end: with the cuboid around the body, as labels of KITTI do, or where the outline ends, which is at the tyres.
+    A class without a label in `labels` is not reported. Labels of one group in `rivals` suppress each other in NMS as
+    if they were one class (a vehicle is not both a car and a truck). `lower_edge` states where boxes of vehicles end:
+    at the cuboid around the body, as KITTI's labels do, or at the tyres.
     """
 
     classes: Count
@@ -132,7 +132,7 @@ class DetectorTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     def __post_init__(self) -> None:
         for index in self.labels:
             if not 0 <= index < self.classes:
-                raise ValueError(f"labels: there is no class {index} among {self.classes} classes")
+                raise ValueError(f"labels: class {index} is not one of {self.classes} classes")
 
 
 class Yolox(DetectorTable, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="decoding", tag="yolox"):
@@ -150,9 +150,9 @@ class CenterNet(
 ):
     """Objects as points: a heat map (1, classes, h, w) with a peak at each centre, its size and its offset in the cell.
 
-    `sizes` is (1, 2, h, w) width and height, in cells of the map or in pixels of the input; `offsets`, where there is
-    one, (1, 2, h, w) x and y in cells, to be added to the peak's cell. `heat` says what the heat map holds: scores, or
-    logits that a sigmoid makes scores. A peak is the largest of its 3x3 cells. NMS joins tiles and rivals.
+    `sizes` (1, 2, h, w) is width and height, in cells of the map or in pixels of the input. The optional `offsets`
+    (1, 2, h, w), x and y in cells, are added to the peak's cell. `heat` states whether the heat map holds scores or
+    logits. A peak is the maximum of its 3x3 cells. NMS merges tiles and rivals.
     """
 
     heat_map: str
@@ -167,8 +167,8 @@ class Ssd(DetectorTable, frozen=True, forbid_unknown_fields=True, kw_only=True, 
     """Prior boxes (N, 4) as x1, y1, x2, y2 in fractions of the input, their shifts (1, N, 4), scores (1, N, classes).
 
     With a prior's centre c and size s, and v of the `variances`: centre = c + v[:2] * shift[:2] * s,
-    size = s * exp(v[2:] * shift[2:]). `scoring` says what makes scores of the numbers; the background is a class too,
-    without a label.
+    size = s * exp(v[2:] * shift[2:]). `scoring` converts the outputs to scores. The background is a class without a
+    label.
     """
 
     locations: str
@@ -181,10 +181,9 @@ class Ssd(DetectorTable, frozen=True, forbid_unknown_fields=True, kw_only=True, 
 class BoxList(DetectorTable, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="decoding", tag="boxes"):
     """Decoded boxes with a score for each class: (1, N, 4) and (1, N, classes), in one output or in two.
 
-    Without `scores` they follow the box in its own output, as YOLOv8 has them. `layout` says which axis comes first:
-    "boxes" (1, N, channels) or "channels" (1, channels, N). `form` is what the four numbers are, `unit` theirs:
-    pixels or fractions of the input. `scoring` makes scores of the numbers: a DETR's last class, of a softmax, is
-    no object and has no label.
+    Without `scores` the scores follow the box in the same output, as in YOLOv8. `layout` is "boxes" (1, N, channels) or
+    "channels" (1, channels, N). `form` is the meaning of the four numbers, `unit` their unit: pixels or fractions of
+    the input. `scoring` converts the outputs to scores. The last class of a DETR, "no object", has no label.
     """
 
     boxes: str
@@ -198,9 +197,9 @@ class BoxList(DetectorTable, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 class ClassMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """One meaning of a (1, channels, h, w) output of scores or logits.
 
-    `channel` is one channel or a list of them, each a class that means the same. By rule "argmax" the meaning is where
-    the largest of all channels is one of these; by "above" where one of these is over `threshold`, which with `sigmoid`
-    is a probability that the output's logits are held against.
+    `channel` is one channel or a list of channels with this meaning. Rule "argmax" selects the pixels whose largest
+    channel is one of these; rule "above" those where one of these exceeds `threshold`. With `sigmoid` the outputs are
+    logits and the threshold is a probability.
     """
 
     meaning: Meaning
@@ -213,16 +212,16 @@ class ClassMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     def __post_init__(self) -> None:
         if not self.chosen or len(set(self.chosen)) != len(self.chosen):
-            raise ValueError(f"channel: a channel, or a list with each channel once, got {self.channel}")
+            raise ValueError(f"channel must be a channel or a list of distinct channels, got {self.channel}")
         for channel in self.chosen:
             if not 0 <= channel < self.channels:
-                raise ValueError(f"channel: there is no channel {channel} among {self.channels}")
+                raise ValueError(f"channel: {channel} is not one of {self.channels} channels")
         if self.rule == "argmax" and self.channels <= len(self.chosen):
-            raise ValueError('rule: "argmax" needs at least one channel more than those chosen: at least two channels')
+            raise ValueError('rule: "argmax" needs at least two channels, one of which is not listed in channel')
         if not math.isfinite(self.threshold) or (self.rule == "argmax" and self.threshold != 0.0):
-            raise ValueError('threshold: a finite number, and only with rule = "above"')
+            raise ValueError('threshold must be finite, and needs rule = "above"')
         if self.sigmoid and not (self.rule == "above" and 0.0 < self.threshold < 1.0):
-            raise ValueError('sigmoid: only with rule = "above" and a threshold between 0 and 1')
+            raise ValueError('sigmoid needs rule = "above" and a threshold between 0 and 1')
 
     @property
     def chosen(self) -> tuple[int, ...]:
@@ -231,30 +230,30 @@ class ClassMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def level(self) -> float:
-        """What a channel must exceed under rule "above", in the output's own numbers."""
+        """The threshold of rule "above", in units of the output."""
         return math.log(self.threshold / (1.0 - self.threshold)) if self.sigmoid else self.threshold
 
 
 class ClassMaps(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="decoding", tag="class_maps"
 ):
-    """Segmentation by class channels that lie over the whole input (padding included)."""
+    """Segmentation by class channels that cover the whole input (padding included)."""
 
     maps: Annotated[tuple[ClassMap, ...], msgspec.Meta(min_length=1)]
 
     def __post_init__(self) -> None:
         meanings = [m.meaning for m in self.maps]
         if len(set(meanings)) != len(meanings):
-            raise ValueError(f"maps: each meaning once, got {', '.join(meanings)}")
+            raise ValueError(f"maps: each meaning must be given once, got {', '.join(meanings)}")
 
 
 class RowAnchors(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="decoding", tag="row_anchors"
 ):
-    """Lane lines by rows (1, columns + 1, rows, lines): logits of a line's column in a row, the last: not there.
+    """Lane lines by rows (1, columns + 1, rows, lines): logits of a line's column in each row; the last is "absent".
 
-    As exports of Ultra-Fast-Lane-Detection give them. `rows` are the rows as fractions of the input's height, in the
-    output's order; `columns` lie evenly from the input's left to its right. The network knows lines and no road.
+    The format of Ultra-Fast-Lane-Detection. `rows` are fractions of the input's height, in the output's order; the
+    `columns` are evenly spaced over the input's width. The network has no road mask.
     """
 
     output: str
@@ -264,7 +263,7 @@ class RowAnchors(
 
     def __post_init__(self) -> None:
         if len(set(self.rows)) != len(self.rows):
-            raise ValueError("rows: each row once")
+            raise ValueError("rows must be distinct")
 
 
 class Disparity(
@@ -272,9 +271,9 @@ class Disparity(
 ):
     """Monodepth2's and Lite-Mono's (1, 1, h, w) sigmoid disparity over the whole input.
 
-    depth = depth_scale / (1 / max + (1 / min - 1 / max) * disparity), with the bounds that the network was trained
-    with; `depth_scale` is 5.4 for networks trained on KITTI's stereo pairs. One trained on single images alone has no
-    scale of its own: `metric` false has the road under the camera give it, frame by frame.
+    depth = depth_scale / (1 / max + (1 / min - 1 / max) * disparity), with the bounds used in training; `depth_scale`
+    is 5.4 for networks trained on KITTI's stereo pairs. A network trained on single images has no metric scale: with
+    `metric` false the road under the camera gives the scale in each frame.
     """
 
     output: str
@@ -286,9 +285,9 @@ class Disparity(
 
     def __post_init__(self) -> None:
         if not self.min_depth_m < self.max_depth_m < math.inf:
-            raise ValueError(f"max_depth_m: {self.max_depth_m} is not over min_depth_m = {self.min_depth_m}")
+            raise ValueError(f"max_depth_m = {self.max_depth_m} must be larger than min_depth_m = {self.min_depth_m}")
         if not math.isfinite(self.depth_scale):
-            raise ValueError("depth_scale: a finite number")
+            raise ValueError("depth_scale must be finite")
 
 
 class MetricDepth(
@@ -296,8 +295,8 @@ class MetricDepth(
 ):
     """(1, 1, h, w) or (1, h, w) depth along the optical axis over the whole input, in units of `metres_per_unit`.
 
-    What lies outside of min_depth_m to max_depth_m is moved to that bound. `canonical_focal_rel` > 0: the network
-    answers for a focal length of this factor times the image width, and is scaled to the camera's.
+    Depths are clipped to min_depth_m .. max_depth_m. With `canonical_focal_rel` > 0 the network assumes a focal length
+    of this factor times the image width; its depths are rescaled to the camera's focal length.
     """
 
     output: str
@@ -309,24 +308,24 @@ class MetricDepth(
 
     def __post_init__(self) -> None:
         if not self.min_depth_m < self.max_depth_m < math.inf:
-            raise ValueError(f"max_depth_m: {self.max_depth_m} is not over min_depth_m = {self.min_depth_m}")
+            raise ValueError(f"max_depth_m = {self.max_depth_m} must be larger than min_depth_m = {self.min_depth_m}")
         if not math.isfinite(self.metres_per_unit):
-            raise ValueError("metres_per_unit: a finite number")
+            raise ValueError("metres_per_unit must be finite")
 
 
 class MultiTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The shipped kind of network: boxes with bodies, masks and depth in one run (perception/decoding/multitask.py).
+    """Boxes with 3-D bodies, masks and depth in one run (perception/decoding/multitask.py).
 
-    A box's centre counts from `score_threshold` on; a mask is where its logit is over the bar.
+    A box needs a centre score of at least `score_threshold`; a mask covers the pixels with a logit above its threshold.
     """
 
     score_threshold: Annotated[float, msgspec.Meta(gt=0.0, lt=1.0)] = 0.3
     nms_iou: Fraction = 0.5
     road_logit: float = 0.0
     lane_logit: float = 0.0
-    box_sigma: BoxSigma = BoxSigma(rel=0.045, px=0.5)  # of the shipped one, on held-out worlds at two image sizes
+    box_sigma: BoxSigma = BoxSigma(rel=0.045, px=0.5)  # of the shipped network
     drawn_inside: DrawnInside = DrawnInside()
-    lower_edge: LowerEdge = "tyres"  # boxes of the built-in world are outlines of its meshes
+    lower_edge: LowerEdge = "tyres"  # the training boxes are outlines of rendered meshes
     depth_sigma_rel: Annotated[float, msgspec.Meta(gt=0.0, lt=1.0)] = 0.15  # 1-sigma of a pixel's depth, as a fraction
 
     def __post_init__(self) -> None:
@@ -335,10 +334,10 @@ class MultiTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
 
 
 class Schedule(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """When this network runs, where a `ModelSpec` states nothing else.
+    """The default schedule of this network; a `ModelSpec` can override it.
 
-    It runs on every `every`-th frame with `threads` threads. Where `awaited` is false no frame waits for it: its result
-    is used once it is there (with patience None it is awaited all the same).
+    It runs on every `every`-th frame with `threads` threads. With `awaited` false no frame waits for it: its result is
+    used as soon as it is available (with patience None every network is awaited).
     """
 
     every: Count = 1
@@ -347,12 +346,12 @@ class Schedule(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
 
 class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What a network takes and gives. The table named like its role says what the outputs mean."""
+    """Input and outputs of a network. The table named after its role defines the outputs."""
 
     role: Role
     input: Input
     title: str = ""
-    sha256: Sha256 = ""  # of the .onnx file; a file with another one is refused
+    sha256: Sha256 = ""  # of the .onnx file; any other file is rejected
     schedule: Schedule = Schedule()
     tiles: Tiles | None = None
     detector: Yolox | CenterNet | Ssd | BoxList | None = None
@@ -365,4 +364,4 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         if given != [self.role]:
             raise ValueError(f"role: a {self.role} needs the table [{self.role}] and no other, got {given}")
         if self.tiles is not None and self.detector is None:
-            raise ValueError(f"tiles: a {self.role} can't run on tiles, only a detector")
+            raise ValueError(f"tiles: only a detector can run on tiles, not a {self.role}")

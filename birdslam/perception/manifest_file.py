@@ -57,9 +57,9 @@ def shipped_manifests() -> dict[str, Path]:
 
 
 def find_manifest(network: Path, sha256: str, explicit: str = "") -> tuple[Manifest, Path]:
-    """The manifest of a network file with the given hash, and the file it came from (see the module's docstring).
+    """The manifest of a network file with the given hash, and its path (see the module's docstring).
 
-    Raises ModelError where there is none, where it can't be read, or where it pins another hash.
+    Raises ModelError if it is missing, unreadable, or states another hash.
     """
     return find_as(network, sha256, explicit, Manifest)
 
@@ -78,7 +78,9 @@ def _locate(network: Path, sha256: str, explicit: str) -> Path:
     if explicit:
         path = shipped.get(explicit, Path(explicit))
         if not path.is_file():
-            raise ModelError(f"{network}: no manifest {explicit!r}: no such file, and shipped are {', '.join(shipped)}")
+            raise ModelError(
+                f"{network}: the manifest {explicit!r} does not exist; name a file or one of {', '.join(shipped)}"
+            )
         return path
     beside = network.with_suffix(".toml")
     if beside.is_file():
@@ -90,5 +92,5 @@ def _locate(network: Path, sha256: str, explicit: str) -> Path:
         return shipped[network.stem]
     raise ModelError(
         f"{network}: no manifest: none beside it ({beside.name}), none shipped with its SHA-256 {sha256} or its name "
-        f"(shipped: {', '.join(shipped)}); state one by manifest ="
+        f"(shipped: {', '.join(shipped)}); name one with manifest ="
     )

@@ -1,4 +1,4 @@
-"""One network: its file, manifest and onnxruntime session. `Network.run` takes an image to findings."""
+"""One network: its file, manifest and onnxruntime session. `Network.run` returns the findings of an image."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ Provider = Literal["auto", "cpu", "openvino", "cuda", "tensorrt"]
 
 
 class ModelSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A network as the configuration names it; None stands for what the manifest states (see `manifest.Schedule`)."""
+    """A network in the configuration; None takes the manifest's value (see `manifest.Schedule`)."""
 
     path: str  # the ONNX file, or a model's name
     manifest: str = ""  # its TOML file, or the name of a shipped manifest; "": FILE.toml beside FILE.onnx
-    every: Count | None = None  # it runs on one frame in so many
+    every: Count | None = None  # frames between two runs
     threads: Annotated[int, msgspec.Meta(ge=1, le=64)] | None = None  # of the network
     awaited: bool | None = None  # whether a frame waits for it, up to its deadline
-    provider: Provider | None = None  # what it is computed by; None: as perceive.provider says
+    provider: Provider | None = None  # execution provider; None: perceive.provider
 
 
 class Decoder(Protocol):
@@ -87,11 +87,11 @@ DECODINGS: dict[type, tuple[Callable[..., Decoder], str, Callable[[Any], tuple[s
 
 
 class _Bound:
-    """A session whose input is `image` and whose outputs are buffers of its own, made once."""
+    """A session whose input is `image` and whose output buffers are allocated once."""
 
     def __init__(self, session: Any, name: str, image: Floats32, outputs: Sequence[str]) -> None:
         self._session = session
-        first = session.run(outputs, {name: image})  # the first run: what is really there
+        first = session.run(outputs, {name: image})  # the real shapes of the outputs
         self.tensors = {output: np.empty(out.shape, np.float32) for output, out in zip(outputs, first, strict=True)}
         self._name, self._image = name, image
         self._binding = session.io_binding()
@@ -100,8 +100,8 @@ class _Bound:
         self.infer()  # warm-up of this path
 
     def infer(self) -> bool:
-        """Runs on what is in the input; False where an output holds a number that is not finite."""
-        image = self._image  # bound again for each run: an accelerator takes its copy when the input is bound
+        """Runs on the input buffer; False if an output is not finite."""
+        image = self._image  # bound again for each run: an accelerator copies the input when it is bound
         self._binding.bind_input(self._name, "cpu", 0, np.float32, image.shape, image.ctypes.data)
         self._session.run_with_iobinding(self._binding)
         self._binding.synchronize_outputs()
@@ -109,7 +109,7 @@ class _Bound:
 
 
 class Network:
-    """A loaded and warmed-up network. One run at a time: the buffers are its own and made once.
+    """A loaded and warmed-up network. Not reentrant: the buffers are allocated once.
 
     Attributes: `name` of the head, `role`, `sha256` of the file, `manifest`, `schedule` in force, `decoder`.
     """
@@ -126,10 +126,10 @@ class Network:
         apart: Collection[str] = (),
         provider: str = "cpu",
     ) -> None:
-        """`unread` are outputs that are not to be computed, `apart` those that `run_without` leaves out too.
+        """Outputs `unread` are not computed; `run_without` also leaves out those in `apart`.
 
-        A `provider` that is not there, or fails later, gives way to the CPU: `fell_back` then says why. Raises
-        ManifestMismatch where manifest and network disagree, an onnxruntime error where it can't run.
+        If the `provider` is missing or fails later, the CPU replaces it and `fell_back` holds the reason. Raises
+        ManifestMismatch if manifest and network disagree, an onnxruntime error if the network cannot run.
         """
         self.name = name
         self.role: Role = manifest.role
@@ -141,10 +141,10 @@ class Network:
         make_decoder, self._finding, outputs_of = DECODINGS[type(table)]
         self._outputs = tuple(output for output in outputs_of(table) if output not in unread)
         self._preparation = Preparation(manifest.input)
-        # here: only who runs networks holds onnxruntime's 18 MB
+        # Imported here: onnxruntime takes 18 MB
         from birdslam.perception.session import SESSION_ERRORS, ProviderMissing, open_session
 
-        self.fell_back = ""  # why it runs on the CPU although something else was asked for
+        self.fell_back = ""  # the reason why the CPU replaces the requested provider
 
         def bound(left_out: Collection[str]) -> _Bound:
             outputs = tuple(output for output in self._outputs if output not in left_out)
@@ -175,7 +175,7 @@ class Network:
         self._bind()
 
     def _computed(self, apart: bool = False) -> _Bound | None:
-        """After a run on the input; None where it gave no numbers. What fails on an accelerator is run on the CPU."""
+        """Runs on the input; None if an output is not finite. A run that fails on an accelerator repeats on the CPU."""
         from birdslam.perception.session import SESSION_ERRORS
 
         try:
@@ -188,7 +188,7 @@ class Network:
             return self._computed(apart)
 
     def views(self, image: NDArray[np.uint8]) -> tuple[View, ...]:
-        """The views in which an image is run, each a run of its own. Raises ValueError where it is no image."""
+        """The views of an image, one run each. Raises ValueError if it is not an image."""
         if image.dtype != np.uint8 or not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)):
             raise ValueError(
                 f"{self.name}: needs a grey (H, W) or BGR (H, W, 3) uint8 image, got {image.dtype} {image.shape}"
@@ -205,19 +205,19 @@ class Network:
         self._preparation.fill(image, view)
 
     def infer(self) -> bool:
-        """Runs the network on its input; False where an output holds a number that is not finite."""
+        """Runs the network on its input; False if an output is not finite."""
         return self._computed() is not None
 
     def read(self, view: View) -> Any:
-        """The outputs of the last run decoded, for `merge`."""
+        """The decoded outputs of the last run, for `merge`."""
         return self.decoder.read(self._whole.tensors, view)
 
     def run(self, image: NDArray[np.uint8]) -> Findings | None:
-        """The findings in a grey (H, W) or BGR (H, W, 3) image of any size; None where the network gave no numbers."""
+        """The findings in a grey (H, W) or BGR (H, W, 3) image of any size; None if an output is not finite."""
         return self._run(image)
 
     def run_without(self, image: NDArray[np.uint8]) -> Findings | None:
-        """As `run`, and the same to a bit, without the outputs that stand `apart` and what only they need."""
+        """As `run`, bit-identical, without the outputs in `apart` and the nodes that only they need."""
         return self._run(image, apart=True)
 
     def _run(self, image: NDArray[np.uint8], apart: bool = False) -> Findings | None:
@@ -236,18 +236,18 @@ class Network:
         return replace(found, segmentation=replace(masks, road=without_verge(masks.road, image)))
 
     def answer(self, image: NDArray[np.uint8]) -> dict[str, Floats32]:
-        """The outputs as they are for an image's first view."""
+        """The raw outputs for an image's first view."""
         self.prepare(image, self.views(image)[0])
         self.infer()
         return {name: tensor.copy() for name, tensor in self._whole.tensors.items()}
 
     @property
     def output_shapes(self) -> dict[str, tuple[int, ...]]:
-        """Of the outputs that the manifest names."""
+        """Shapes of the outputs that the manifest names."""
         return {name: tensor.shape for name, tensor in self._whole.tensors.items()}
 
     def describe(self) -> dict[str, Any]:
-        """What ran, for a summary: plain values."""
+        """The network's settings as plain values, for a summary."""
         from birdslam.perception.session import onnxruntime_version
 
         return {
@@ -269,17 +269,17 @@ class Network:
 def load_network(
     name: str,
     spec: ModelSpec,
-    most_threads: int | None = None,
+    max_threads: int | None = None,
     unread: Collection[str] = (),
     apart: Collection[str] = (),
 ) -> Network:
     """Opens a network, checks its manifest against its real inputs and outputs, and warms it up.
 
-    Where the `spec` does not say how many threads it has, these are its manifest's, but no more than `most_threads`.
-    Of a multi-task network the outputs `unread` are not computed, which "depth" alone may be, and `run_without` leaves
-    out `apart` too, which "segmentation" alone may be. A provider "auto" is the CPU here: what is fastest is
-    measured by runtime/models/providers.py. A `name` that is a role's must be the manifest's. Raises
-    ModelError naming the file, the key, what the manifest says and what the network has.
+    Without `threads` in the `spec`, the manifest's count applies, limited to `max_threads`. A multi-task network does
+    not compute the outputs in `unread` (only "depth" is allowed); `run_without` also leaves out those in `apart` (only
+    "segmentation" is allowed). Provider "auto" is the CPU here; runtime/models/providers.py measures the fastest one.
+    If `name` is a role, the manifest must have the same role. Raises ModelError, which names the file, the key and both
+    values.
     """
     path = Path(spec.path)
     try:
@@ -289,11 +289,11 @@ def load_network(
     sha256 = hashlib.sha256(content).hexdigest()
     manifest, origin = find_manifest(path, sha256, spec.manifest)
     if name in get_args(Role) and name != manifest.role:
-        raise ModelError(f"{path}: role: the manifest {origin} says {manifest.role}, it was given as the {name}")
+        raise ModelError(f"{path}: role: the manifest {origin} says {manifest.role}, but the network is used as {name}")
     stated = {key: value for key in ("every", "threads", "awaited") if (value := getattr(spec, key)) is not None}
     schedule = msgspec.structs.replace(manifest.schedule, **stated)
-    if most_threads is not None and spec.threads is None:
-        schedule = msgspec.structs.replace(schedule, threads=min(schedule.threads, most_threads))
+    if max_threads is not None and spec.threads is None:
+        schedule = msgspec.structs.replace(schedule, threads=min(schedule.threads, max_threads))
     refuse_weights_elsewhere(path, content)
     from birdslam.perception.session import SESSION_ERRORS
 
@@ -304,14 +304,14 @@ def load_network(
     except ManifestMismatch as error:
         raise ModelError(f"{path}: {error} (manifest {origin})") from error
     except SESSION_ERRORS as error:
-        raise ModelError(f"{path}: no network that onnxruntime can run: {error}") from error
+        raise ModelError(f"{path}: onnxruntime can't run this network: {error}") from error
 
 
 def refuse_weights_elsewhere(path: Path, content: bytes) -> None:
-    """Raises ModelError where the network is not whole in its file: its SHA-256 would not hold what it computes."""
+    """Raises ModelError if weights are in another file: the network's SHA-256 would not cover them."""
     try:
         elsewhere = has_weights_elsewhere(content)
     except ValueError as error:
-        raise ModelError(f"{path}: no network that onnxruntime can run: {error}") from error
+        raise ModelError(f"{path}: onnxruntime can't run this network: {error}") from error
     if elsewhere:
-        raise ModelError(f"{path}: its weights lie in another file (external data): a network must be whole in its own")
+        raise ModelError(f"{path}: its weights are in another file (external data); save the network as one file")

@@ -25,23 +25,23 @@ from birdslam.perception.manifest_file import find_as
 from birdslam.perception.network import ModelSpec, refuse_weights_elsewhere
 from birdslam.perception.pointnet_manifest import Bins, Body, PointNetManifest, Points
 
-CORE = 0.5  # of a box's width and height, about its middle: where its vehicle is
-REACH_M = 8.0  # from the depth of the core: points farther off are of another body or the background
+CORE_RATIO = 0.5  # central part of a box's width and height, which shows its vehicle
+MAX_DEPTH_OFFSET_M = 8.0  # from the core's depth; points beyond belong to another body or the background
 MIN_POINTS = 16
-REFERENCE_M = 20.0  # of the feature log_depth
+REFERENCE_DEPTH_M = 20.0  # of the feature log_depth
 MIN_HALF_SPAN = 1e-6  # of a box, at a depth of 1
 
 
 @dataclass(frozen=True)
 class Frustum:
-    """The network's input for one box, and how to turn its output back to camera axes."""
+    """The network's input for one box, and the transform of its output back to the camera frame."""
 
     features: Floats32  # (C, count)
     azimuth_rad: float  # of the box's middle, to the right of the optical axis
-    middle_m: Floats  # (3,) what the points lie about, in the turned axes; zero where they are not centred
+    middle_m: Floats  # (3,) origin of the points in the rotated axes; zero if they are not centred
 
     def to_camera(self, turned_m: Floats) -> Floats:
-        """(3,) a point of the turned axes, in the camera frame."""
+        """Transforms a point (3,) from the rotated axes to the camera frame."""
         x, y, z = (turned_m + self.middle_m).tolist()
         c, s = math.cos(self.azimuth_rad), math.sin(self.azimuth_rad)
         return np.array([c * x + s * z, y, c * z - s * x])
@@ -53,9 +53,9 @@ def frustum_of(points_cam_m: Floats, points: Points) -> Frustum | None:
         return None
     u, v = points_cam_m[:, 0] / points_cam_m[:, 2], points_cam_m[:, 1] / points_cam_m[:, 2]
     offsets = [(w - (w.min() + w.max()) / 2.0) / max((w.max() - w.min()) / 2.0, MIN_HALF_SPAN) for w in (u, v)]
-    core = (np.abs(offsets[0]) <= CORE) & (np.abs(offsets[1]) <= CORE)
+    core = (np.abs(offsets[0]) <= CORE_RATIO) & (np.abs(offsets[1]) <= CORE_RATIO)
     depth_m = float(np.median(points_cam_m[core, 2])) if core.any() else float(np.median(points_cam_m[:, 2]))
-    near = np.flatnonzero(np.abs(points_cam_m[:, 2] - depth_m) <= REACH_M)
+    near = np.flatnonzero(np.abs(points_cam_m[:, 2] - depth_m) <= MAX_DEPTH_OFFSET_M)
     if len(near) < MIN_POINTS or depth_m <= 0.0:
         return None
     picked = near[np.arange(points.count) * len(near) // points.count]  # evenly, in the order of the pixels
@@ -67,7 +67,9 @@ def frustum_of(points_cam_m: Floats, points: Points) -> Frustum | None:
     middle_m = np.array([0.0, middle_v * depth_m, depth_m / c]) if points.centred else np.zeros(3)
     rows = dict(zip(("x", "y", "z"), (turned - middle_m[:, None]) * points.scale, strict=True))
     rows.update(
-        u=offsets[0][picked], v=offsets[1][picked], log_depth=np.full(len(picked), math.log(depth_m / REFERENCE_M))
+        u=offsets[0][picked],
+        v=offsets[1][picked],
+        log_depth=np.full(len(picked), math.log(depth_m / REFERENCE_DEPTH_M)),
     )
     return Frustum(np.stack([rows[name] for name in points.features]).astype(np.float32), azimuth_rad, middle_m)
 
@@ -76,7 +78,7 @@ class PointNet:
     """A loaded and warmed-up Frustum-PointNet. Attributes as those of `network.Network`."""
 
     def __init__(self, path: Path, manifest: PointNetManifest, sha256: str, content: bytes, schedule: Schedule) -> None:
-        """Raises ManifestMismatch where manifest and network disagree, an onnxruntime error where it can't run."""
+        """Raises ManifestMismatch if manifest and network disagree, an onnxruntime error if the network cannot run."""
         self.name = self.role = "pointnet"
         self.path, self.manifest, self.sha256, self.schedule = path, manifest, sha256, schedule
         from birdslam.perception.session import plain_session  # here, as in network.py
@@ -116,7 +118,7 @@ class PointNet:
         return dict(zip(names, ((1, 3), (1, bins), (1, bins), (1, sizes), (1, sizes, 3)), strict=True))
 
     def _run(self, boxes: Floats32, labels: Sequence[str]) -> dict[str, Floats32]:
-        """Outputs for N boxes; a network of a fixed batch is run as often as need be."""
+        """Outputs for N boxes; a network with a fixed batch size runs several times."""
         points, step = self.manifest.points, self._batch or max(len(boxes), 1)
         parts: list[list[Floats32]] = []
         for start in range(0, len(boxes), step):
@@ -134,7 +136,7 @@ class PointNet:
         return {name: np.concatenate(outs) for name, outs in zip(self._outputs, zip(*parts, strict=True), strict=True)}
 
     def locate(self, frusta_cam_m: Sequence[Floats], labels: Sequence[str], camera: Camera) -> Boxes3d | None:
-        """A body for the points (N, 3) of each box, in camera; None where the network gave no usable numbers.
+        """The body for the points (N, 3) of each box, in the camera frame; None if an output is not finite.
 
         A box with too few points near its middle has an unknown body, with infinite sigmas.
         """
@@ -159,7 +161,7 @@ class PointNet:
         return out
 
     def describe(self) -> dict[str, Any]:
-        """What ran, for a summary: plain values."""
+        """The network's settings as plain values, for a summary."""
         from birdslam.perception.session import onnxruntime_version
 
         return {
@@ -201,7 +203,7 @@ def decode_bins(
     bin_, size = int(scores.argmax()), int(tensors[table.size_scores].argmax())
     width_rad = 2.0 * math.pi / len(scores)
     heading_rad = bin_ * width_rad + float(tensors[table.heading_residuals][bin_]) * width_rad / 2.0
-    # About down and from the right, to about up and from ahead
+    # From a rotation about down, 0 to the right, to one about up, 0 ahead
     _write(frustum, tensors[table.centre], -heading_rad - math.pi / 2.0, camera, out, row)
     out.sigma_depth_m[row] = table.sigma_rel * out.depth_m[row]
     template = np.array(table.templates_m[size])
@@ -212,7 +214,7 @@ def decode_bins(
 
 
 def _write(frustum: Frustum, centre_m: Floats, yaw_rad: float, camera: Camera, out: Boxes3d, row: int) -> None:
-    """Centre and observation angle: the yaw is against the box's ray, alpha against the centre's."""
+    """Writes centre and observation angle: the yaw is relative to the box's ray, alpha to the centre's ray."""
     x, y, z = frustum.to_camera(centre_m).tolist()
     z = max(z, 0.1)
     out.centre_px[row] = camera.fx_px * x / z + camera.cx_px, camera.fy_px * y / z + camera.cy_px
@@ -257,4 +259,4 @@ def load_pointnet(spec: ModelSpec) -> PointNet:
     except ManifestMismatch as error:
         raise ModelError(f"{path}: {error} (manifest {origin})") from error
     except SESSION_ERRORS as error:
-        raise ModelError(f"{path}: no network that onnxruntime can run: {error}") from error
+        raise ModelError(f"{path}: onnxruntime can't run this network: {error}") from error

@@ -14,9 +14,9 @@ Feature = Literal["x", "y", "z", "u", "v", "log_depth"]
 class Points(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The network's input, float32, `count` points of each of N boxes.
 
-    x, y, z in metres along the camera's axes turned to the box, `scale` times; with `centred` about a point in it; u
-    and v in [-1, 1] are the point's place in its box; log_depth that of the box's middle against 20 m, for all points
-    alike. `classes`, with the name of a second input `class_name` (N, classes), is what a one-hot class means.
+    x, y, z are metres times `scale`, in camera axes rotated to the box; with `centred` relative to a point in the box.
+    u and v in [-1, 1] are the point's position in its box. log_depth is that of the box's middle relative to 20 m, the
+    same for all points. A second input `class_name` (N, classes) takes the class one-hot, in the order of `classes`.
     """
 
     name: str
@@ -30,15 +30,15 @@ class Points(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
     def __post_init__(self) -> None:
         if bool(self.class_name) != bool(self.classes):
-            raise ValueError("class_name: stands with classes, or neither does")
+            raise ValueError("class_name and classes need each other: give both or neither")
         if len(set(self.features)) != len(self.features):
-            raise ValueError(f"features: each once, got {', '.join(self.features)}")
+            raise ValueError(f"features must be distinct, got {', '.join(self.features)}")
 
 
 class Body(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="decoding", tag="body"):
-    """(N, 12): the centre x y z in metres, in the axes of the points; log of the Laplace scale of z; logs of length,
-    width, height against `mean_m`; cos and sin of the doubled yaw, times von Mises' concentration; cos and sin of the
-    yaw, times the logit that its front is there; log of the Laplace scale of the sizes, as a fraction of them.
+    """(N, 12): the centre x, y, z in metres, in the axes of the points; log of the Laplace scale of z; logs of length,
+    width, height relative to `mean_m`; cos and sin of twice the yaw, times the von Mises concentration; cos and sin of
+    the yaw, times the logit that the front points there; log of the relative Laplace scale of the sizes.
 
     The yaw is about up: 0 faces away along the box's ray, pi/2 faces left.
     """
@@ -48,7 +48,7 @@ class Body(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
 
     def __post_init__(self) -> None:
         if not all(0.0 < m < 100.0 for m in self.mean_m):
-            raise ValueError("mean_m: three lengths in metres")
+            raise ValueError("mean_m must be three lengths between 0 and 100 m")
 
 
 class Bins(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="decoding", tag="bins"):
@@ -56,7 +56,7 @@ class Bins(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     residuals (N, S, 3).
 
     A heading is about the camera's down axis, 0 faces right; residuals are in half bins, sizes (length, width, height)
-    in fractions of `templates_m`. Its answers have no sigmas of their own: `sigma_rel` is of the depth.
+    in fractions of `templates_m`. The network outputs no sigmas; `sigma_rel` is that of the depth.
     """
 
     centre: str

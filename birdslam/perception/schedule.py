@@ -24,8 +24,8 @@ CARRIED: dict[Role, Status] = {
     "depth": Status.DEPTH_CARRIED,
 }
 FIELDS: dict[Role, str] = {"detector": "detections", "segmenter": "segmentation", "depth": "depth"}  # of `Perception`
-BESIDE_BOXES: tuple[Role, ...] = ("segmenter", "depth")  # what networks look for where the boxes are another detector's
-ROLES: dict[Role, tuple[Role, ...]] = {"multitask": ("detector", "segmenter", "depth")}  # others fill their own
+ROLES_BESIDE_BOXES: tuple[Role, ...] = ("segmenter", "depth")  # that networks keep beside an external detector
+ROLES: dict[Role, tuple[Role, ...]] = {"multitask": ("detector", "segmenter", "depth")}  # others have only their own
 NO_DETECTIONS = Detections(np.zeros((0, 4)), np.zeros(0), ())
 
 
@@ -33,9 +33,9 @@ NO_DETECTIONS = Detections(np.zeros((0, 4)), np.zeros(0), ())
 class Perception:
     """The latest results of the networks at one frame.
 
-    `ages`: head's name -> frames since that of its result, 0 is this frame; a head without a result yet is absent. A
-    head with several roles has an entry for each role, not for its name. A result of an earlier frame has its status in
-    `status`. `awaited_from`: no detections of frames before it are still to come.
+    `ages` maps a head's name to the age of its result in frames; a head without a result is absent. A head with several
+    roles has an entry for each role, not for its name. A result of an earlier frame has its status in `status`.
+    `awaited_from`: the detections of all earlier frames are complete.
     """
 
     detections: Detections | None = None
@@ -64,9 +64,9 @@ class Ready:
 
 @dataclass(frozen=True)
 class WithDetections:
-    """A pending perception whose boxes are another detector's, of the frame itself.
+    """A pending perception whose boxes come from an external detector, computed on the frame itself.
 
-    Without `depth` no depth map is used: that of a network of several roles is its detector's (`Networks.bodies`).
+    Without `depth` no depth map is used: the depth map of a multi-task network belongs to its own detector.
     """
 
     pending: Pending
@@ -98,7 +98,7 @@ class Followed:
 
 
 class Head(Protocol):
-    """What `Networks` needs of a `Network`."""
+    """The part of `Network` that `Networks` uses."""
 
     @property
     def name(self) -> str: ...
@@ -113,7 +113,7 @@ class Head(Protocol):
 
 @dataclass
 class _Slot:
-    """One head's run and its last results."""
+    """The current run of one head and its last results."""
 
     head: Head
     fills: tuple[Role, ...]  # the roles that its findings are used for
@@ -121,17 +121,17 @@ class _Slot:
     started_frame: int | None = None
     masks: bool = True  # the last run started includes masks
     without_masks: int = 0  # runs since the last one that included them
-    outdated: bool = False  # the run under way is of frames before a restart of the source
+    outdated: bool = False  # the current run belongs to frames before a restart of the source
     findings: Findings = field(default_factory=Findings)
     found: dict[Role, int] = field(default_factory=dict)  # the frame that each result was computed on
 
     def begin(self, frame_id: int, masks: bool) -> None:
-        """A run on this frame."""
+        """Records the start of a run on this frame."""
         self.started_frame, self.masks = frame_id, masks
         self.without_masks = 0 if masks else self.without_masks + 1
 
     def take(self, findings: Findings) -> None:
-        """The result of the last run that was started."""
+        """Stores the result of the last run."""
         assert self.started_frame is not None
         roles = ROLES.get(self.head.role, (self.head.role,))
         if not self.masks:
@@ -147,16 +147,15 @@ class _Slot:
 
 
 class Networks:
-    """Starts each head on the frames that it is due on and carries its last result in between.
+    """Starts each head on the frames where it is due and carries its last result in between.
 
-    A head is due when `every` frames, times `slowdown`, have passed since the one it last started on; while its run is
-    under way it is not started again. `slowdown` may be set between two frames. A head with several roles leaves those
-    to others that have a head of their own; with `bodies` its 3-D boxes are still used in the other detector's boxes,
-    if of the same image (`decoding.detection.with_bodies`). `boxes_alone` runs such a head without its masks; with
-    `masks_every` one run in so many includes them. `submit(run, image) -> Future` is an executor's (birdslam has no
-    threads of its own; it needs one for each head). With `patience_s` None every running head is awaited, so that the
-    results depend on the frames alone. Else `result()` waits that long in all, for the heads that started on its frame
-    and are `awaited`; the others' results are carried, and they go on in the background.
+    A head is due `every` * `slowdown` frames after its last start, unless it is still running. `slowdown` may be set
+    between two frames. A multi-task head yields each role that another head has; with `bodies` its 3-D boxes still
+    complete the other detector's boxes of the same image (`decoding.detection.with_bodies`). `boxes_alone` runs such a
+    head without its masks; one run in `masks_every` includes them. `submit(run, image) -> Future` belongs to an
+    executor with a thread per head. With `patience_s` None every running head is awaited, so the results depend only on
+    the frames. Otherwise `result()` waits at most that long for the `awaited` heads that started on its frame; all
+    other heads continue in the background and their last results are carried.
     """
 
     def __init__(
@@ -171,7 +170,7 @@ class Networks:
         for key in ("name", "role"):
             values = [getattr(head, key) for head in heads]
             if len(set(values)) != len(values):
-                raise ValueError(f"networks: each {key} once, got {', '.join(values)}")
+                raise ValueError(f"networks: each {key} must be unique, got {', '.join(values)}")
         if patience_s is not None and not patience_s >= 0.0:
             raise ValueError(f"networks: patience_s must not be negative, got {patience_s}")
         self.heads = tuple(heads)
@@ -189,7 +188,7 @@ class Networks:
         ]
         self._last_frame = -1
         self.slowdown = self.masks_every = 1
-        self.looks = 0  # frames on which a head was begun
+        self.frames_with_start = 0  # frames on which a head was started
 
     def start(
         self,
@@ -198,11 +197,11 @@ class Networks:
         only: Collection[Role] | None = None,
         detections: Detections | None = None,
     ) -> Pending:
-        """Starts the heads that are due, of the roles in `only` (None: all). `detections` are another detector's.
+        """Starts the heads that are due, of the roles in `only` (None: all). `detections` are an external detector's.
 
-        `result()` of what is returned is to be asked for once, before the next start. The image must stay as it is
-        while a head may read it. None (no pixels in this frame) starts nothing. A frame_id that doesn't grow is a
-        source that restarted: what is known of the old frames is forgotten.
+        Call `result()` of the returned object once, before the next start. The image must not change while a head may
+        read it; None (a frame without pixels) starts nothing. A frame_id that does not grow means that the source
+        restarted: earlier results are discarded.
         """
         if frame_id <= self._last_frame:
             self._slots = [_Slot(s.head, s.fills, s.running, outdated=s.running is not None) for s in self._slots]
@@ -212,7 +211,7 @@ class Networks:
             if image is not None:
                 detections = detections.inside(image.shape[1], image.shape[0])
         if detections is not None:
-            only = BESIDE_BOXES if only is None else tuple(role for role in only if role in BESIDE_BOXES)
+            only = ROLES_BESIDE_BOXES if only is None else tuple(role for role in only if role in ROLES_BESIDE_BOXES)
         started_any = False
         for slot in self._slots:
             every = slot.head.schedule.every * self.slowdown
@@ -222,7 +221,7 @@ class Networks:
             if image is not None and due and wanted and slot.running is None:
                 slot.running = self._submit(self._begin(slot, frame_id), image)
                 started_any = True
-        self.looks += started_any
+        self.frames_with_start += started_any
         pending = _Started(self, frame_id)
         if detections is None:
             return pending
@@ -249,7 +248,7 @@ class Networks:
             start_next()  # for a frame whose result was not taken
 
     def _begin(self, slot: _Slot, frame_id: int) -> Callable[[NDArray[np.uint8]], Findings | None]:
-        """What is to run for a slot."""
+        """Records the start of a run of this slot and returns the function to run."""
         boxes = self._boxes_alone if slot.head.role in ROLES and "segmenter" in slot.found else None
         slot.begin(frame_id, masks=boxes is None or slot.without_masks + 1 >= self.masks_every)
         return slot.head.run if slot.masks or boxes is None else boxes
@@ -265,12 +264,12 @@ class Networks:
         )
 
     def _awaited_from(self, frame_id: int) -> int:
-        """The frame of the detections under way; the next one where there are none."""
+        """The frame of the detector's current run; the next frame if it is idle."""
         under_way = (s.started_frame for s in self._slots if s.running is not None and "detector" in s.fills)
         return min((frame for frame in under_way if frame is not None), default=frame_id + 1)
 
     def _with_bodies(self, detections: Detections | None) -> Detections | None:
-        """The detector's boxes with the bodies that a head of several roles found in the same image."""
+        """The detector's boxes with the bodies that the multi-task head found in the same image."""
         own = next((s for s in self._slots if s.head.role == "detector"), None)
         many = next((s for s in self._slots if s.head.role in ROLES), None)
         if not self._bodies or detections is None or own is None or many is None:
@@ -279,7 +278,7 @@ class Networks:
         return with_bodies(detections, many.findings.detections) if same_image else detections
 
     def _await(self, frame_id: int) -> None:
-        """Until the heads that the frame waits for are done, or its patience is over."""
+        """Waits for the heads of this frame, at most `patience_s`."""
         if self._patience_s is None:
             wait([s.running for s in self._slots if s.running is not None])
         else:
@@ -293,7 +292,7 @@ class Networks:
             )
 
     def _take_results(self, frame_id: int) -> list[Status]:
-        """The results that are there replace the older ones; returns the status of what failed or is carried."""
+        """Stores the finished results; returns a status for each that failed or is carried."""
         status = [Status.PROVIDER_MISSING] if any(slot.head.fell_back for slot in self._slots) else []
         for slot in self._slots:
             if slot.running is not None and slot.running.done():

@@ -16,19 +16,19 @@ SESSION_ERRORS: tuple[type[Exception], ...] = tuple(
 )
 _START_ERRORS: tuple[type[Exception], ...] = (*SESSION_ERRORS, RuntimeError)  # the last: without TensorRT's libraries
 CPU = "CPUExecutionProvider"
-EXECUTION_PROVIDERS = {  # of the configuration -> of onnxruntime; the packages that bring them: docs/networks.md
+EXECUTION_PROVIDERS = {  # configuration -> onnxruntime; docs/networks.md lists the packages
     "cpu": CPU,
     "openvino": "OpenVINOExecutionProvider",
     "cuda": "CUDAExecutionProvider",
     "tensorrt": "TensorrtExecutionProvider",
 }
-_QUIET = 4  # what goes wrong is raised; onnxruntime's logger would write it to the terminal too
+_QUIET = 4  # errors are raised; onnxruntime's logger would also print them
 _NVIDIA = frozenset({"cuda", "tensorrt"})
 _FLOAT32 = "tensor(float)"
 
 
 def session_options(threads: int) -> ort.SessionOptions:
-    """As every network here runs: on so many threads, which sleep when they wait."""
+    """Options of all sessions: the number of threads, which sleep while they wait."""
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
@@ -36,22 +36,22 @@ def session_options(threads: int) -> ort.SessionOptions:
     options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_ALL
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.add_session_config_entry("session.inter_op.allow_spinning", "0")
-    options.enable_mem_pattern = False  # as fast without, and 10 of 29 MB less for the shipped network
+    options.enable_mem_pattern = False  # saves memory at the same speed
     options.log_severity_level = _QUIET
     return options
 
 
 def onnxruntime_version() -> str:
-    """Of the package that is there: onnxruntime, or one with more providers."""
+    """Version of the installed onnxruntime package."""
     return str(ort.__version__)
 
 
 class ProviderMissing(Exception):
-    """The provider is not part of this onnxruntime, or does not start on this computer."""
+    """The installed onnxruntime lacks the provider, or the provider does not start on this computer."""
 
 
 def providers_here() -> tuple[str, ...]:
-    """Of EXECUTION_PROVIDERS those that this onnxruntime was built with, "cpu" first."""
+    """The EXECUTION_PROVIDERS of the installed onnxruntime, "cpu" first."""
     built = set(ort.get_available_providers())
     return tuple(name for name, theirs in EXECUTION_PROVIDERS.items() if theirs in built)
 
@@ -63,8 +63,8 @@ def _options_of(provider: str, threads: int) -> dict[str, str]:
 
 
 def _nvidia_libraries() -> str:
-    """Loads CUDA's and cuDNN's libraries from where pip put them; what went wrong, as onnxruntime prints it, or ""."""
-    if not hasattr(ort, "preload_dlls"):  # before 1.21: the loader's own path then
+    """Loads CUDA's and cuDNN's libraries from pip's packages; returns onnxruntime's error text or ""."""
+    if not hasattr(ort, "preload_dlls"):  # before 1.21
         return ""
     with contextlib.redirect_stdout(io.StringIO()) as said:
         ort.preload_dlls()
@@ -72,16 +72,16 @@ def _nvidia_libraries() -> str:
 
 
 def plain_session(content: bytes, threads: int) -> ort.InferenceSession:
-    """Of a network as it is, compared with no manifest."""
+    """A session that is not checked against a manifest."""
     return ort.InferenceSession(content, session_options(threads), providers=[CPU])
 
 
 def open_session(
     content: bytes, input: Input, outputs: tuple[str, ...], threads: int, provider: str = "cpu"
 ) -> ort.InferenceSession:
-    """A session with the input's shape fixed, after its inputs and outputs were compared with the manifest.
+    """A session with a fixed input shape, checked against the manifest.
 
-    Raises ProviderMissing where the provider can't be had, and ManifestMismatch.
+    Raises ProviderMissing and ManifestMismatch.
     """
     probe_options = session_options(1)
     probe_options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
@@ -114,7 +114,7 @@ def open_session(
     if provider == "cpu":
         return ort.InferenceSession(whole, options, providers=[CPU])
     if provider not in providers_here():
-        raise ProviderMissing(f"this onnxruntime has no {provider}, but {', '.join(providers_here())}")
+        raise ProviderMissing(f"the installed onnxruntime has {', '.join(providers_here())}, not {provider}")
     wanted = EXECUTION_PROVIDERS[provider]
     missing = _nvidia_libraries() if provider in _NVIDIA else ""
     ort.set_default_logger_severity(_QUIET)
@@ -122,7 +122,7 @@ def open_session(
     try:
         session = ort.InferenceSession(whole, options, providers=providers, enable_fallback=0)
     except _START_ERRORS as error:
-        raise ProviderMissing(f"{provider} does not begin: {error}") from error
-    if session.get_providers()[0] != wanted:  # onnxruntime goes to the CPU by itself
-        raise ProviderMissing(f"{provider} does not begin on this computer{missing and ': ' + missing}")
+        raise ProviderMissing(f"{provider} does not start: {error}") from error
+    if session.get_providers()[0] != wanted:  # onnxruntime falls back to the CPU
+        raise ProviderMissing(f"{provider} does not start on this computer{missing and ': ' + missing}")
     return session

@@ -15,9 +15,9 @@ from birdslam.perception.manifest import FitPad, Input, Tiles
 
 @dataclass(frozen=True)
 class View:
-    """A column of the image, x0_px to x1_px over its full height, and the rectangle of the input it is resized to.
+    """A column of the image, x0_px to x1_px over the full height, and its rectangle in the network's input.
 
-    Coordinates are of pixel edges, not centres: the image spans (0, 0) to (width, height).
+    Coordinates refer to pixel edges, not centres: the image spans (0, 0) to (width, height).
     """
 
     image_width_px: int
@@ -31,29 +31,29 @@ class View:
 
     @property
     def ratio(self) -> Floats:
-        """(2,): input pixels in an image pixel, along x and y."""
+        """(2,): input pixels per image pixel, along x and y."""
         return np.array([self.width_px / (self.x1_px - self.x0_px), self.height_px / self.image_height_px])
 
     def crop(self, plane: Floats32, input: Input) -> Floats32:
-        """(h, w), not copied: the rectangle of this view in a map (H, W) over the whole input, coarser or not."""
+        """This view's rectangle (h, w), not copied, of a map (H, W) over the whole input at any resolution."""
         fy, fx = plane.shape[0] / input.height_px, plane.shape[1] / input.width_px
         rows = slice(round(self.top_px * fy), max(round((self.top_px + self.height_px) * fy), 1))
         columns = slice(round(self.left_px * fx), max(round((self.left_px + self.width_px) * fx), 1))
         return plane[rows, columns]
 
     def to_image(self, boxes_px: Floats) -> Floats:
-        """Boxes (N, 4) of the input in the image."""
+        """Transforms boxes (N, 4) from the input to the image."""
         corners = boxes_px.reshape(-1, 2, 2) - [self.left_px, self.top_px]
         return (corners / self.ratio + [self.x0_px, 0.0]).reshape(-1, 4)
 
     def to_network(self, boxes_px: Floats) -> Floats:
-        """Boxes (N, 4) of the image in the input."""
+        """Transforms boxes (N, 4) from the image to the input."""
         corners = boxes_px.reshape(-1, 2, 2) - [self.x0_px, 0.0]
         return (corners * self.ratio + [self.left_px, self.top_px]).reshape(-1, 4)
 
 
 def make_views(width_px: int, height_px: int, input: Input, tiles: Tiles | None) -> tuple[View, ...]:
-    """The views that cover an image, left to right: one, or the columns that `tiles` asks for, all of one width."""
+    """The views that cover an image, left to right: one, or the columns of `tiles`, all of equal width."""
     columns, overlap = (tiles.columns, tiles.overlap) if tiles is not None else (1, 0.0)
     for count in range(1, columns + 1):
         tile_px = min(width_px, math.ceil(width_px / (count - (count - 1) * overlap)))
@@ -83,13 +83,13 @@ def _placement(width_px: int, height_px: int, input: Input) -> tuple[int, int, i
 
 
 class Preparation:
-    """Fills the network's input tensor from an image; the buffers are made once."""
+    """Fills the network's input tensor from an image; the buffers are allocated once."""
 
     def __init__(self, input: Input) -> None:
         self.input = input
         planes = (1, 3, input.height_px, input.width_px)
         self.tensor = np.zeros(planes if input.layout == "NCHW" else (1, *planes[2:], 3), dtype=np.float32)
-        # (3, H, W) whatever the layout: what is written to.
+        # A (3, H, W) view of the tensor for either layout
         self._planes = self.tensor[0] if input.layout == "NCHW" else np.moveaxis(self.tensor[0], -1, 0)
         self._gain = [np.float32(input.scale / s) for s in input.std]
         self._offset = [np.float32(-m / s) for m, s in zip(input.mean, input.std, strict=True)]
@@ -110,7 +110,7 @@ class Preparation:
                 plane += offset
 
     def _canvas(self, ndim: int, view: View) -> NDArray[np.uint8]:
-        """The padded image at the input's size; its padding is painted where the rectangle has moved."""
+        """The padded image at the input's size; a moved rectangle gets new padding."""
         size = (self.input.height_px, self.input.width_px)
         if ndim not in self._canvases:
             self._canvases[ndim] = np.empty(size if ndim == 2 else (*size, 3), dtype=np.uint8)

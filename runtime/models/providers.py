@@ -44,13 +44,13 @@ def compared(
     spec: ModelSpec,
     providers: Collection[str],
     within_s: float = MEASURED_S,
-    most_threads: int | None = None,
+    max_threads: int | None = None,
 ) -> dict[str, Measured]:
     """Measures the providers on a noise image of the network's size; "cpu" is the reference."""
     out: dict[str, Measured] = {}
     truth: dict[str, np.ndarray] = {}
     for provider in ("cpu", *(each for each in providers if each != "cpu")):
-        network = load_network(role, msgspec.structs.replace(spec, provider=provider), most_threads)
+        network = load_network(role, msgspec.structs.replace(spec, provider=provider), max_threads)
         if network.provider != provider:
             out[provider] = Measured(float("inf"), float("inf"), network.fell_back)
             continue
@@ -63,14 +63,14 @@ def compared(
     return out
 
 
-def chosen(role: str, spec: ModelSpec, asked: str, here: Collection[str], most_threads: int | None = None) -> ModelSpec:
+def chosen(role: str, spec: ModelSpec, asked: str, here: Collection[str], max_threads: int | None = None) -> ModelSpec:
     """Returns the network with the selected provider; its own overrides `asked`, which is perceive.provider."""
     asked = spec.provider or asked
     if asked != "auto":
         return msgspec.structs.replace(spec, provider=asked)
     if set(here) == {"cpu"}:
         return msgspec.structs.replace(spec, provider="cpu")
-    figures = compared(role, spec, here, most_threads=most_threads)
+    figures = compared(role, spec, here, max_threads=max_threads)
     best = min((name for name, found in figures.items() if found.agrees), key=lambda name: figures[name].ms)
     if figures[best].ms > MAX_TIME_RATIO * figures["cpu"].ms:
         best = "cpu"

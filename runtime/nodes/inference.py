@@ -60,7 +60,7 @@ class Inference(Closing):
         schedule, looks = configuration.perceive.schedule, configuration.perceive.looks
         specs = {role: schedule.of(role, spec) for role, spec in configuration.models.in_use().items()}
         self._adapts = looks.adaptive and not configuration.lossless
-        most_threads = threads_of_a_network(usable_cores()) if self._adapts else None
+        max_threads = threads_of_a_network(usable_cores()) if self._adapts else None
         pointnet = configuration.models.pointnet
         unread = UNREAD_WITH_BODIES if pointnet is None else ()
         chosen = any(spec.every is not None for spec in specs.values())  # by the user: no adaptation
@@ -69,8 +69,8 @@ class Inference(Closing):
             specs.pop("detector", None)
         whole = boxes is not None or chosen or bool({"detector", "segmenter"} & specs.keys())
         apart = APART if self._adapts and not whole else ()
-        specs = self._computed_by(specs, configuration, most_threads)
-        heads = [load_network(role, spec, most_threads, unread, apart) for role, spec in specs.items()]
+        specs = self._computed_by(specs, configuration, max_threads)
+        heads = [load_network(role, spec, max_threads, unread, apart) for role, spec in specs.items()]
         for head in heads:
             if head.fell_back:
                 log.warning("%s runs on the CPU: %s", head.role, head.fell_back)
@@ -111,13 +111,13 @@ class Inference(Closing):
 
     @staticmethod
     def _computed_by(
-        specs: dict[str, ModelSpec], configuration: Configuration, most_threads: int | None
+        specs: dict[str, ModelSpec], configuration: Configuration, max_threads: int | None
     ) -> dict[str, ModelSpec]:
         """Selects the provider of each network; at rate "max" the CPU, so that runs are reproducible."""
         from birdslam.perception.session import providers_here
 
         asked, here = configuration.perceive.provider, ("cpu",) if configuration.lossless else providers_here()
-        return {role: chosen(role, spec, asked, here, most_threads) for role, spec in specs.items()}
+        return {role: chosen(role, spec, asked, here, max_threads) for role, spec in specs.items()}
 
     def _submit(self, run: Run, *arguments: Any) -> Future[Any]:
         if run not in self._awaited and self._deadline_ns is not None:

@@ -1,4 +1,4 @@
-"""Detectors with lists of boxes: SSD's shifted priors, and boxes that the network has decoded itself."""
+"""Decoders of box lists: SSD's shifted priors, and boxes that the network decodes itself."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from birdslam.perception.decoding.detection import (
 from birdslam.perception.manifest import BoxList, Input, ManifestMismatch, Scoring, Ssd
 from birdslam.perception.views import View
 
-LARGEST_LOG = 20.0  # of a size over its prior's, and of a logit: past it numbers have gone wild
+MAX_LOG = 20.0  # of a size relative to its prior, and of a logit: avoids overflow
 
 
 class _ListDecoder:
-    """Boxes (N, 4) and scores (N, classes) of one run, each class above the threshold a candidate."""
+    """Selects candidates from boxes (N, 4) and scores (N, classes): each class above the threshold is one."""
 
     def __init__(self, table: Ssd | BoxList, input: Input) -> None:
         self._detector = table
@@ -39,7 +39,7 @@ class _ListDecoder:
         return rows[best], self._wanted[columns[best]], found[best]
 
     def merge(self, parts: Sequence[Candidates], views: Sequence[View]) -> Detections:
-        """The boxes of all views of one image, each object once."""
+        """Merges the boxes of all views of one image."""
         return merge_views(parts, views, self._groups, self._detector)
 
 
@@ -47,7 +47,7 @@ class SsdDecoder(_ListDecoder):
     """Reads SSD outputs (see `manifest.Ssd`)."""
 
     def __init__(self, table: Ssd, input: Input, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        """Raises ManifestMismatch where the outputs' shapes aren't what the manifest makes of them."""
+        """Raises ManifestMismatch if the outputs' shapes contradict the manifest."""
         super().__init__(table, input)
         self.table = table
         priors = shapes[table.priors]
@@ -60,13 +60,13 @@ class SsdDecoder(_ListDecoder):
                 )
 
     def read(self, tensors: Mapping[str, Floats32], view: View) -> Candidates:
-        """The boxes of one run above the score threshold, in the image and cut to it."""
+        """The boxes of one run above the score threshold, clipped to the image."""
         rows, classes, scores = self.chosen(tensors[self.table.scores][0], self.table.scoring)
         priors = tensors[self.table.priors][rows].astype(np.float64)
         shifts = tensors[self.table.locations][0, rows] * np.array(self.table.variances)
         size = priors[:, 2:] - priors[:, :2]
         centre = (priors[:, :2] + priors[:, 2:]) / 2.0 + shifts[:, :2] * size
-        half = size * np.exp(np.clip(shifts[:, 2:], -LARGEST_LOG, LARGEST_LOG)) / 2.0
+        half = size * np.exp(np.clip(shifts[:, 2:], -MAX_LOG, MAX_LOG)) / 2.0
         boxes = np.hstack([centre - half, centre + half]) * np.tile(self._input_px, 2)
         return candidates_in_image(boxes, scores, classes, view)
 
@@ -75,7 +75,7 @@ class BoxListDecoder(_ListDecoder):
     """Reads decoded boxes with a score for each class (see `manifest.BoxList`)."""
 
     def __init__(self, table: BoxList, input: Input, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        """Raises ManifestMismatch where the outputs' shapes aren't what the manifest makes of them."""
+        """Raises ManifestMismatch if the outputs' shapes contradict the manifest."""
         super().__init__(table, input)
         self.table = table
         wanted = {table.boxes: 4, table.scores: table.classes} if table.scores else {table.boxes: 4 + table.classes}
@@ -93,7 +93,7 @@ class BoxListDecoder(_ListDecoder):
             raise ManifestMismatch("detector.scores", f"as many as {table.boxes} has boxes", shapes[table.scores])
 
     def read(self, tensors: Mapping[str, Floats32], view: View) -> Candidates:
-        """The boxes of one run above the score threshold, in the image and cut to it."""
+        """The boxes of one run above the score threshold, clipped to the image."""
         table = self.table
         boxes = self._rows(tensors[table.boxes])
         numbers = self._rows(tensors[table.scores]) if table.scores else boxes[:, 4:]
@@ -113,7 +113,7 @@ class BoxListDecoder(_ListDecoder):
 def _scores(numbers: Floats32, scoring: Scoring) -> Floats:
     values = numbers.astype(np.float64)
     if scoring == "sigmoid":
-        return 1.0 / (1.0 + np.exp(-np.clip(values, -LARGEST_LOG, LARGEST_LOG)))
+        return 1.0 / (1.0 + np.exp(-np.clip(values, -MAX_LOG, MAX_LOG)))
     if scoring == "softmax":
         powers = np.exp(values - values.max(axis=1, keepdims=True))
         out: Floats = powers / powers.sum(axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""CenterNet: an object is a peak of a heat map."""
+"""Decoder of CenterNet: each peak of the heat map is an object."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from birdslam.perception.decoding.detection import (
 from birdslam.perception.manifest import CenterNet, Input, ManifestMismatch
 from birdslam.perception.views import View
 
-LARGEST_LOGIT = 60.0  # past it a sigmoid is 1 in any float
+MAX_LOGIT = 60.0  # beyond it the sigmoid is 1 in floating point
 
 
 class CenterNetDecoder:
     """Reads CenterNet outputs (see `manifest.CenterNet`)."""
 
     def __init__(self, table: CenterNet, input: Input, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        """Raises ManifestMismatch where the outputs' shapes aren't what the manifest makes of them."""
+        """Raises ManifestMismatch if the outputs' shapes contradict the manifest."""
         self.table = table
         heat = shapes[table.heat_map]
         if len(heat) != 4 or heat[0] != 1:
@@ -41,11 +41,11 @@ class CenterNetDecoder:
         self._wanted = np.array(sorted(table.labels))
 
     def read(self, tensors: Mapping[str, Floats32], view: View) -> Candidates:
-        """The peaks of one run above the score threshold, as boxes in the image and cut to it."""
+        """The peaks of one run above the score threshold, as boxes clipped to the image."""
         table = self.table
         heat = tensors[table.heat_map][0, self._wanted]
         if table.heat == "logits":
-            heat = 1.0 / (1.0 + np.exp(-np.clip(heat, -LARGEST_LOGIT, LARGEST_LOGIT)))
+            heat = 1.0 / (1.0 + np.exp(-np.clip(heat, -MAX_LOGIT, MAX_LOGIT)))
         around = np.stack([cv2.dilate(plane, np.ones((3, 3), np.uint8)) for plane in heat])
         planes, rows, columns = np.nonzero((heat >= table.score_threshold) & (heat == around))
         scores = heat[planes, rows, columns].astype(np.float64)
@@ -61,5 +61,5 @@ class CenterNetDecoder:
         return candidates_in_image(np.hstack([centre - half, centre + half]), scores, self._wanted[planes], view)
 
     def merge(self, parts: Sequence[Candidates], views: Sequence[View]) -> Detections:
-        """The boxes of all views of one image, each object once."""
+        """Merges the boxes of all views of one image."""
         return merge_views(parts, views, self._groups, self.table)

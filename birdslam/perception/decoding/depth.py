@@ -1,4 +1,4 @@
-"""Depth maps, and the decoders of the networks that give them."""
+"""Depth maps and their decoders."""
 
 from __future__ import annotations
 
@@ -18,12 +18,11 @@ Table = TypeVar("Table", Disparity, MetricDepth)
 
 @dataclass(frozen=True)
 class DepthMap:
-    """`depth_m` (h, w) float32: depth along the optical axis, a positive finite number for every pixel.
+    """`depth_m` (h, w) float32: depth along the optical axis, positive and finite for every pixel.
 
-    It lies over the whole undistorted image but may be coarser; `image_width_px`, `image_height_px` are the image's.
-    With `canonical_focal_rel` > 0 the numbers are those of a camera whose focal length is this factor times its image's
-    width: `in_metres` makes them the camera's own. Without `metric` they are known up to one factor, which the road
-    gives (birdslam/vehicles/placement/pseudolidar.py).
+    The map covers the whole undistorted image of `image_width_px` x `image_height_px` at its own resolution. With
+    `canonical_focal_rel` > 0 depths refer to a focal length of this factor times the image width; `in_metres` converts
+    them. Without `metric` the scale is unknown; the road gives it (birdslam/vehicles/placement/pseudolidar.py).
     """
 
     depth_m: Floats32
@@ -35,11 +34,11 @@ class DepthMap:
 
     @property
     def scale(self) -> tuple[float, float]:
-        """Pixels of the map in a pixel of the image, along x and y."""
+        """Map pixels per image pixel, along x and y."""
         return self.depth_m.shape[1] / self.image_width_px, self.depth_m.shape[0] / self.image_height_px
 
     def at(self, points_px: Floats) -> Floats32:
-        """(N,) depths at points (N, 2) of the image, each of the nearest pixel of the map; a point outside has NaN."""
+        """Depths (N,) at points (N, 2) of the image, from the nearest pixel of the map; NaN outside."""
         x, y = np.floor((points_px + 0.5) * self.scale).astype(np.int64).T
         height, width = self.depth_m.shape
         inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
@@ -48,16 +47,16 @@ class DepthMap:
         return out
 
     def cells(self, box_px: Sequence[float]) -> tuple[slice, slice]:
-        """Rows and columns of the map whose centres lie in a box x1, y1, x2, y2 of the image; may be empty."""
+        """Rows and columns of the map whose centres are in a box x1, y1, x2, y2 of the image; may be empty."""
         sx, sy = self.scale
         height, width = self.depth_m.shape
-        # The centre of the map's pixel i lies at (i + 0.5) / scale of the image, in coordinates of pixels' edges.
+        # Pixel i of the map has its centre at (i + 0.5) / scale in the image, in coordinates of pixel edges
         x1, x2 = (min(max(int(np.ceil(x * sx - 0.5)), 0), width) for x in (box_px[0], box_px[2]))
         y1, y2 = (min(max(int(np.ceil(y * sy - 0.5)), 0), height) for y in (box_px[1], box_px[3]))
         return slice(y1, max(y1, y2)), slice(x1, max(x1, x2))
 
     def points_cam_m(self, camera: Camera, rows: slice, columns: slice) -> Floats:
-        """(N, 3) the pseudo-lidar of a block of the map: its pixels' centres at their depth, in the camera frame."""
+        """Pseudo-lidar points (N, 3) of a block of the map, in the camera frame."""
         sx, sy = self.scale
         depth = self.depth_m[rows, columns].astype(np.float64)
         u, v = np.meshgrid(
@@ -68,11 +67,11 @@ class DepthMap:
         return np.column_stack([x.ravel(), y.ravel(), depth.ravel()])
 
     def scaled(self, factor: float) -> DepthMap:
-        """The same map, all depths times a factor, in metres of the camera at hand."""
+        """The map with all depths times a factor, in metres for this camera."""
         return replace(self, depth_m=self.depth_m * np.float32(factor), metric=True, canonical_focal_rel=0.0)
 
     def in_metres(self, camera: Camera) -> DepthMap:
-        """The map with the depths of this camera; itself where its depths are not canonical."""
+        """Converts canonical depths to this camera's; returns itself if they are not canonical."""
         if self.canonical_focal_rel <= 0.0:
             return self
         factor = camera.fx_px / (self.canonical_focal_rel * self.image_width_px)
@@ -80,10 +79,10 @@ class DepthMap:
 
 
 class _MapDecoder(Generic[Table]):
-    """Reads one map over the whole image."""
+    """Decodes one map over the whole image."""
 
     def __init__(self, table: Table, input: Input, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        """Raises ManifestMismatch where the output is no map."""
+        """Raises ManifestMismatch if the output is not a map."""
         self.table: Table = table
         self.input = input
         _check_map(table.output, shapes[table.output])
@@ -112,7 +111,7 @@ class DisparityDecoder(_MapDecoder[Disparity]):
 
 
 class MetricDepthDecoder(_MapDecoder[MetricDepth]):
-    """Reads depth as it is (see `manifest.MetricDepth`)."""
+    """Reads metric depth (see `manifest.MetricDepth`)."""
 
     def read(self, tensors: Mapping[str, Floats32], view: View) -> DepthMap:
         """The depth of one run over the whole image."""
@@ -133,5 +132,5 @@ def _check_map(output: str, shape: tuple[int, ...]) -> None:
 
 
 def _of_image(tensor: Floats32, view: View, input: Input) -> Floats32:
-    """(h, w): the part of a map over the whole input that lies over the image, a copy."""
+    """A copy of the part (h, w) of a map over the whole input that covers the image."""
     return view.crop(tensor.reshape(tensor.shape[-2], tensor.shape[-1]), input).copy()

@@ -1,4 +1,4 @@
-"""Detections in the image: YOLOX decoding, class-wise NMS, merging of tiles, and bodies by another network."""
+"""Detections in the image: YOLOX decoding, class-wise NMS, merging of tiles, and bodies from another network."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from birdslam.perception.boxes3d import Boxes3d
 from birdslam.perception.manifest import BoxSigma, DetectorTable, DrawnInside, Input, LowerEdge, ManifestMismatch, Yolox
 from birdslam.perception.views import View
 
-CUT_MARGIN = 0.015  # of a tile's width: a box that ends so near to a tile's inner edge is taken to go on behind it
-INSIDE = 0.6  # of a cut box's area inside a whole box: the same object
-MAX_CANDIDATES = 400  # of one run: a network that fails must not cost memory and time without bound
-SAME_ROWS = 0.5  # overlap over union of the rows of two halves of one object
-MIN_BODY_IOU = 0.5  # of two networks' boxes of one object, as of a match in most benchmarks
+CUT_MARGIN_RATIO = 0.015  # of a tile's width: a box this close to a tile's inner edge is cut by it
+MIN_COVERED_RATIO = 0.6  # of a cut box's area inside a whole box of the same object
+MAX_CANDIDATES = 400  # of one run; bounds memory and time when a network fails
+MIN_ROWS_IOU = 0.5  # of the rows of two halves of one object
+MIN_BODY_IOU = 0.5  # of two networks' boxes of one object; the usual threshold of a match
 
 
 @dataclass(frozen=True)
 class EdgeSigma:
-    """1-sigma of a box's left, right, upper and lower edge as fractions of its side, and on top `px` of the image."""
+    """1-sigma of a box's left, right, upper and lower edge: a fraction of its side plus `px` of the image."""
 
     rel: tuple[float, float, float, float]
     px: float
@@ -29,11 +29,11 @@ class EdgeSigma:
 
 @dataclass(frozen=True)
 class Detections:
-    """Boxes (N, 4) x1, y1, x2, y2 in pixels of the undistorted image, scores (N,) in [0, 1] falling, labels.
+    """Boxes (N, 4) x1, y1, x2, y2 in pixels of the undistorted image, scores (N,) in [0, 1] descending, labels.
 
-    `boxes3d` holds a body for each box, where the network knows of bodies. `edge_sigma` says how sure their edges are;
-    None: the network does not say. `lower_edge` is as of `manifest.DetectorTable`. `track_ids` (N,) are another
-    tracker's, negative where it follows none; None: tracks are ours.
+    `boxes3d` holds a body for each box if the network estimates bodies. `edge_sigma` is the uncertainty of the edges;
+    None: unknown. `lower_edge` is that of `manifest.DetectorTable`. `track_ids` (N,) come from an external tracker,
+    negative without a track; None: no external tracker.
     """
 
     boxes_px: Floats
@@ -79,7 +79,7 @@ class Detections:
 class Candidates:
     """Boxes (N, 4) before NMS in image pixels, with scores (N,) and class ids (N,).
 
-    `cut` (N, 2): whether a box goes on behind the view's left, right edge.
+    `cut` (N, 2): whether the view's left, right edge cuts the box.
     """
 
     boxes_px: Floats
@@ -92,24 +92,24 @@ class YoloxDecoder:
     """Reads YOLOX outputs (see `manifest.Yolox`)."""
 
     def __init__(self, table: Yolox, input: Input, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        """Raises ManifestMismatch where the output's shape isn't what the manifest makes of it."""
+        """Raises ManifestMismatch if the output's shape contradicts the manifest."""
         self.table = table
         cells, strides = _grid(input.width_px, input.height_px, table.strides)
         shape = shapes[table.output]
         if len(shape) != 3 or shape[0] != 1:
             raise ManifestMismatch("detector.output", f"{table.output} of shape (1, cells, 5 + classes)", shape)
         if shape[1] != len(cells):
-            stated = f"{list(table.strides)} over {input.width_px}x{input.height_px}, which are {len(cells)} cells"
+            stated = f"{list(table.strides)} over {input.width_px}x{input.height_px}, that is {len(cells)} cells"
             raise ManifestMismatch("detector.strides", stated, f"{shape[1]} cells in {table.output} {shape}")
         if shape[2] != 5 + table.classes:
-            stated = f"{table.classes}, so {5 + table.classes} channels"
+            stated = f"{table.classes}, that is {5 + table.classes} channels"
             raise ManifestMismatch("detector.classes", stated, f"{shape[2]} channels in {table.output} {shape}")
         self._cells, self._strides = cells, strides
         self._groups = rival_groups(table.classes, table.labels, table.rivals)
         self._wanted = np.isin(np.arange(table.classes), list(table.labels))
 
     def read(self, tensors: Mapping[str, Floats32], view: View) -> Candidates:
-        """The boxes of one run above the score threshold, in the image and cut to it."""
+        """The boxes of one run above the score threshold, clipped to the image."""
         raw = tensors[self.table.output][0]
         rows = np.flatnonzero(raw[:, 4] >= self.table.score_threshold)  # class scores are <= 1
         chosen = raw[rows].astype(np.float64)
@@ -124,12 +124,12 @@ class YoloxDecoder:
         return candidates_in_image(np.hstack([centre - half, centre + half]), scores, classes, view)
 
     def merge(self, parts: Sequence[Candidates], views: Sequence[View]) -> Detections:
-        """The boxes of all views of one image, each object once."""
+        """Merges the boxes of all views of one image."""
         return merge_views(parts, views, self._groups, self.table)
 
 
 def edge_sigma(table: BoxSigma | None, view: View) -> EdgeSigma | None:
-    """1-sigma of a box's edges by its manifest, in the image."""
+    """Converts the manifest's sigmas of box edges to pixels of the image."""
     if table is None:
         return None
     left, right, upper, lower = (
@@ -139,7 +139,7 @@ def edge_sigma(table: BoxSigma | None, view: View) -> EdgeSigma | None:
 
 
 def drawn_out(boxes_px: Floats, inside: DrawnInside, view: View) -> Floats:
-    """Boxes (N, 4) of the image with each edge moved out to where the object ends; one at the border stays there."""
+    """Moves the edges of boxes (N, 4) of the image out to the object's outline; edges at the border stay."""
     width, height = (boxes_px[:, 2:] - boxes_px[:, :2]).T
     moves = [-inside.left * width, -inside.upper * height, inside.right * width, inside.lower * height]
     limits = np.array([view.image_width_px, view.image_height_px] * 2, dtype=np.float64)
@@ -149,7 +149,7 @@ def drawn_out(boxes_px: Floats, inside: DrawnInside, view: View) -> Floats:
 
 
 def rival_groups(classes: int, labels: Mapping[int, str], rivals: Sequence[Sequence[str]]) -> Ints:
-    """(classes,): classes that compete in NMS share a number, that of their group; every other has its own."""
+    """Group numbers (classes,): classes that compete in NMS share a number."""
     group_of = {label: i for i, group in enumerate(rivals) for label in group}
     groups = np.arange(classes) + len(rivals)
     for index, label in labels.items():
@@ -158,9 +158,9 @@ def rival_groups(classes: int, labels: Mapping[int, str], rivals: Sequence[Seque
 
 
 def candidates_in_image(boxes_px: Floats, scores: Floats, classes: Ints, view: View) -> Candidates:
-    """Boxes (N, 4) of the network's input, in the image and cut to the view; slivers are left out."""
+    """Boxes (N, 4) of the network's input, transformed to the image and clipped to the view, without slivers."""
     boxes = view.to_image(boxes_px)
-    margin_px = CUT_MARGIN * (view.x1_px - view.x0_px)
+    margin_px = CUT_MARGIN_RATIO * (view.x1_px - view.x0_px)
     cut = np.column_stack(
         [
             (boxes[:, 0] < view.x0_px + margin_px) & (view.x0_px > 0),
@@ -174,13 +174,13 @@ def candidates_in_image(boxes_px: Floats, scores: Floats, classes: Ints, view: V
 
 
 def merge_views(parts: Sequence[Candidates], views: Sequence[View], groups: Ints, table: DetectorTable) -> Detections:
-    """The boxes of all views of one image, each object once; `groups` (classes,) as `rival_groups` gives them."""
+    """Merges the boxes of all views of one image; `groups` (classes,) comes from `rival_groups`."""
     boxes, scores, classes, cut = (
         np.concatenate([getattr(part, field) for part in parts]) for field in ("boxes_px", "scores", "classes", "cut")
     )
     kept = suppress(boxes, scores, groups[classes], cut, table.nms_iou)
     boxes, scores, classes, cut = boxes[kept], scores[kept], classes[kept], cut[kept]
-    slack_px = 2.0 * CUT_MARGIN * (views[0].x1_px - views[0].x0_px)
+    slack_px = 2.0 * CUT_MARGIN_RATIO * (views[0].x1_px - views[0].x0_px)
     boxes, alive = join_halves(boxes, groups[classes], cut, slack_px)
     order = alive[np.argsort(-scores[alive], kind="stable")]
     labels = tuple(table.labels[int(c)] for c in classes[order])
@@ -190,7 +190,7 @@ def merge_views(parts: Sequence[Candidates], views: Sequence[View], groups: Ints
 
 
 def _grid(width_px: int, height_px: int, strides: Sequence[int]) -> tuple[Floats, Floats]:
-    """Cells (N, 2) as x, y and their strides (N, 1), row by row, one stride after the other."""
+    """Cells (N, 2) as x, y and their strides (N, 1), row by row, one stride after another."""
     cells, sizes = [], []
     for stride in strides:
         y, x = np.mgrid[0 : height_px // stride, 0 : width_px // stride]
@@ -200,7 +200,7 @@ def _grid(width_px: int, height_px: int, strides: Sequence[int]) -> tuple[Floats
 
 
 def intersections(boxes: Floats) -> Floats:
-    """(N, N) areas that each two of the boxes (N, 4) share."""
+    """Areas (N, N) of the intersections of the boxes (N, 4)."""
     low = np.maximum(boxes[:, None, :2], boxes[None, :, :2])
     high = np.minimum(boxes[:, None, 2:], boxes[None, :, 2:])
     out: Floats = np.prod(np.clip(high - low, 0.0, None), axis=-1)
@@ -210,14 +210,14 @@ def intersections(boxes: Floats) -> Floats:
 def suppress(boxes: Floats, scores: Floats, groups: Ints, cut: Bools, nms_iou: float) -> Ints:
     """Indices that survive NMS within each group, best first: whole boxes before cut ones, then by score (stable).
 
-    A cut box (N, 2: on its left, on its right) yields to one that covers it, since the overlap over union of a part
-    says little. The two halves of one object don't beat each other: `join_halves` makes one of them.
+    A cut box (N, 2: on its left, on its right) yields to one that covers it, since the IoU of a part is not
+    informative. Two halves of one object do not suppress each other: `join_halves` joins them.
     """
     shared = intersections(boxes)
     area = np.diagonal(shared)
     partial = cut[:, 0] | cut[:, 1]
     halves = np.outer(cut[:, 0], cut[:, 1]) | np.outer(cut[:, 1], cut[:, 0])
-    covers = (shared >= INSIDE * area[None, :]) & partial[None, :] & (area[:, None] > area[None, :])
+    covers = (shared >= MIN_COVERED_RATIO * area[None, :]) & partial[None, :] & (area[:, None] > area[None, :])
     beaten = covers | (shared > nms_iou * (area[:, None] + area[None, :] - shared))  # [i, j]: i beats j
     beaten &= ~halves & (groups[:, None] == groups[None, :]) & ~np.eye(len(boxes), dtype=bool)
     alive = np.ones(len(boxes), dtype=bool)
@@ -229,9 +229,9 @@ def suppress(boxes: Floats, scores: Floats, groups: Ints, cut: Bools, nms_iou: f
 
 
 def join_halves(boxes: Floats, groups: Ints, cut: Bools, slack_px: float) -> tuple[Floats, Ints]:
-    """An object wider than the overlap leaves a half in two neighbouring tiles: they become one box, left to right.
+    """Joins the two halves of an object that is wider than the overlap of two neighbouring tiles.
 
-    Such halves both span the overlap, to `slack_px`. Returns the boxes and the indices of those that stand.
+    Both halves span the overlap to within `slack_px`. Returns the boxes and the indices of those kept.
     """
     boxes = boxes.copy()
     stands = np.ones(len(boxes), dtype=bool)
@@ -240,7 +240,7 @@ def join_halves(boxes: Floats, groups: Ints, cut: Bools, slack_px: float) -> tup
         for j in rightward[cut[rightward, 0]]:
             a, b = boxes[i], boxes[j]
             rows = min(a[3], b[3]) - max(a[1], b[1])
-            same_rows = rows > SAME_ROWS * (max(a[3], b[3]) - min(a[1], b[1]))
+            same_rows = rows > MIN_ROWS_IOU * (max(a[3], b[3]) - min(a[1], b[1]))
             meet = a[0] - slack_px <= b[0] <= a[2] <= b[2] + slack_px
             if i != j and stands[i] and stands[j] and groups[i] == groups[j] and same_rows and meet:
                 boxes[i] = np.concatenate([np.minimum(a[:2], b[:2]), np.maximum(a[2:], b[2:])])
@@ -249,10 +249,10 @@ def join_halves(boxes: Floats, groups: Ints, cut: Bools, slack_px: float) -> tup
 
 
 def with_bodies(detections: Detections, others: Detections | None) -> Detections:
-    """The detections (N) with the bodies of the boxes of `others`, of the same image, that overlap them most.
+    """The detections (N) with the bodies of the boxes of `others`, in the same image, that overlap them most.
 
-    A box without such an overlap has an unknown body, with infinite sigmas. Detections with bodies of their own stay as
-    they are.
+    A box without such an overlap gets an unknown body, with infinite sigmas. Detections that already have bodies are
+    returned unchanged.
     """
     if others is None or others.boxes3d is None or detections.boxes3d is not None:
         return detections

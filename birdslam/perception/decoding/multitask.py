@@ -1,7 +1,7 @@
-"""The multi-task network: boxes with 3-D boxes, masks, and a depth map, of one run.
+"""Decoder of the multi-task network: boxes with 3-D bodies, masks, and a depth map.
 
-Its depths are canonical, z * (0.58 * width / fx): those of a camera whose focal length is `CANONICAL_FOCAL` of the
-image's width. So one network serves many cameras; `in_metres` converts by the camera's focal length.
+Depths are canonical, z * (0.58 * width / fx), for a focal length of `CANONICAL_FOCAL_REL` times the image width, so one
+network serves many cameras; `in_metres` converts them to the camera's focal length.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from birdslam.perception.decoding.segmentation import Segmentation
 from birdslam.perception.manifest import Input, Label, ManifestMismatch, MultiTask
 from birdslam.perception.views import View
 
-CANONICAL_FOCAL = 0.58  # of the image's width
+CANONICAL_FOCAL_REL = 0.58  # of the image's width
 INPUT = "image"
 OUTPUTS = ("segmentation", "depth", "heat", "body")
 MASKS = ("road", "lane")  # channels of "segmentation": logits
@@ -39,16 +39,15 @@ BODY_CHANNELS = {
     "front": 2,  # cos and sin of alpha, times the logit of "this end is the front"
 }
 MEAN_SIZE_M = (4.3, 1.8, 1.6)
-# By how much sizes are off on real cars, a car's means: images of KITTI tracking 0002 and 0005 (`perf networks`). On
-# held-out simulated frames it is 0.10, 0.045 and 0.07: real cars are shorter and narrower than those it learned from
+# Relative error of sizes on real cars (`perf networks`)
 SIGMA_SIZE_REL = (0.20, 0.15, 0.08)
 MAX_CANDIDATES = 100  # of one run
-_LOG_SIDE_MAX = 6.0  # a side of 400 cells is longer than any input
+MAX_LOG_SIDE = 6.0  # 400 cells, longer than any input
 
 
 @dataclass(frozen=True)
 class Findings:
-    """Detections, masks and depth of one image; None where the network does not give them."""
+    """Detections, masks and depth of one image; None if the network does not output them."""
 
     detections: Detections | None = None
     segmentation: Segmentation | None = None
@@ -56,7 +55,7 @@ class Findings:
 
 
 def body_slices() -> dict[str, slice]:
-    """Where each part of "body" lies among its channels."""
+    """Channel range of each part of "body"."""
     out, at = {}, 0
     for name, channels in BODY_CHANNELS.items():
         out[name] = slice(at, at + channels)
@@ -68,14 +67,14 @@ _BODY = body_slices()
 
 
 class MultiTaskDecoder:
-    """Reads the four outputs (see `manifest.MultiTask`). Depths stay canonical, and say so: no camera is known here."""
+    """Reads the four outputs (see `manifest.MultiTask`). Depths stay canonical: the camera is not known here."""
 
     def __init__(self, table: MultiTask, input: Input, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        """Raises ManifestMismatch where an output's shape isn't what the manifest makes of it."""
+        """Raises ManifestMismatch if an output's shape contradicts the manifest."""
         self.table, self.input = table, input
         channels = (len(MASKS), 1, len(CLASSES), sum(BODY_CHANNELS.values()))
         for output, count in zip(OUTPUTS, channels, strict=True):
-            if output not in shapes:  # nobody reads it
+            if output not in shapes:  # not computed
                 continue
             shape = shapes[output]
             if len(shape) != 4 or shape[:2] != (1, count):
@@ -87,8 +86,8 @@ class MultiTaskDecoder:
 
     def read(self, tensors: Mapping[str, Floats32], view: View) -> Findings:
         """The findings of one run over the whole image."""
-        # The canonical focal length is a share of what the network sees; padding makes it another share of the image.
-        focal_rel = CANONICAL_FOCAL * self.input.width_px / float(view.width_px)
+        # The canonical focal length is relative to the input's width, which with padding differs from the image's
+        focal_rel = CANONICAL_FOCAL_REL * self.input.width_px / float(view.width_px)
         return Findings(
             detections=self._detections(tensors["heat"][0], tensors["body"][0], view, focal_rel),
             segmentation=self._segmentation(tensors["segmentation"][0], view) if "segmentation" in tensors else None,
@@ -101,7 +100,7 @@ class MultiTaskDecoder:
         return part
 
     def _segmentation(self, logits: Floats32, view: View) -> Segmentation:
-        """Logits and not masks are resized: the border is smooth at the image's resolution."""
+        """Resizes logits rather than masks, for a smooth border at the image's resolution."""
         size = (view.image_width_px, view.image_height_px)
         road, lane = (
             cv2.resize(view.crop(plane, self.input), size, interpolation=cv2.INTER_LINEAR) for plane in logits
@@ -118,12 +117,12 @@ class MultiTaskDecoder:
         )
 
     def _detections(self, heat: Floats32, body: Floats32, view: View, focal_rel: float) -> Detections:
-        """The peaks of the heat map with the body's channels there, each box once, the best score first."""
+        """The peaks of the heat map with the body's channels, after NMS, best score first."""
         classes, ys, xs = self._peaks(heat)
         at = body[:, ys, xs].T.astype(np.float64)  # (N, channels)
         scores = 1.0 / (1.0 + np.exp(-heat[classes, ys, xs].astype(np.float64)))
         cells = np.column_stack([xs, ys]).astype(np.float64) + 0.5
-        sides = np.exp(np.minimum(at[:, _BODY["sides"]], _LOG_SIDE_MAX))
+        sides = np.exp(np.minimum(at[:, _BODY["sides"]], MAX_LOG_SIDE))
         corners = np.hstack([cells - sides[:, :2], cells + sides[:, 2:]]) * np.tile(self._cell, 2)
         boxes = view.to_image(corners)
         boxes[:, 0::2] = np.clip(boxes[:, 0::2], 0.0, view.image_width_px)
@@ -139,7 +138,7 @@ class MultiTaskDecoder:
         return Detections(outlines, scores[rows], labels, bodies, sigma, self.table.lower_edge)
 
     def _peaks(self, heat: Floats32) -> tuple[Ints, Ints, Ints]:
-        """Class, row and column of the cells that are hotter than their neighbours, best first."""
+        """Class, row and column of the heat map's peaks, best first."""
         bar = math.log(self.table.score_threshold / (1.0 - self.table.score_threshold))
         peaks = [(plane >= cv2.dilate(plane, self._kernel)) & (plane > bar) for plane in heat]
         classes, ys, xs = np.nonzero(peaks)
@@ -152,12 +151,12 @@ class MultiTaskDecoder:
         depth_m = np.exp(at[:, _BODY["log_depth"]][:, 0])
         size_m = np.exp(at[:, _BODY["log_size"]]) * MEAN_SIZE_M
         axis, front = at[:, _BODY["axis"]], at[:, _BODY["front"]]
-        alpha_rad = 0.5 * np.arctan2(axis[:, 1], axis[:, 0])  # modulo pi; the front says which end
+        alpha_rad = 0.5 * np.arctan2(axis[:, 1], axis[:, 0])  # modulo pi; `front` resolves the ambiguity
         logit = front[:, 0] * np.cos(alpha_rad) + front[:, 1] * np.sin(alpha_rad)
         alpha_rad = np.where(logit >= 0.0, alpha_rad, alpha_rad - np.copysign(np.pi, alpha_rad))
         concentration = np.maximum(np.hypot(axis[:, 0], axis[:, 1]), 0.5)
         return Boxes3d(
-            centre_px=view.to_image(centres)[:, :2] - 0.5,  # from pixels' edges to their centres, as a camera counts
+            centre_px=view.to_image(centres)[:, :2] - 0.5,  # from pixel edges to pixel centres
             depth_m=depth_m,
             size_m=size_m,
             alpha_rad=alpha_rad,

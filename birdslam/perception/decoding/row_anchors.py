@@ -1,4 +1,4 @@
-"""Lane lines by rows: for each line and row of the image a choice of column, as Ultra-Fast-Lane-Detection has it."""
+"""Decoder of lane lines by rows: a distribution over columns for each line and row (Ultra-Fast-Lane-Detection)."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from birdslam.perception.manifest import Input, ManifestMismatch, RowAnchors
 from birdslam.perception.views import View
 
 MIN_POINTS = 2  # of a line
-LINE_REL = 0.006  # thickness of a drawn line in widths of the image: what a painted line has some 15 m ahead
+LINE_WIDTH_REL = 0.006  # of a drawn line, in image widths: a painted line about 15 m ahead
 
 
 class RowAnchorsDecoder:
     """Reads columns by rows (see `manifest.RowAnchors`)."""
 
     def __init__(self, table: RowAnchors, input: Input, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        """Raises ManifestMismatch where the output's shape isn't what the manifest makes of it."""
+        """Raises ManifestMismatch if the output's shape contradicts the manifest."""
         self.table, self.input = table, input
         stated = (1, table.columns + 1, len(table.rows), table.lines)
         if tuple(shapes[table.output]) != stated:
             raise ManifestMismatch("segmenter.output", f"{table.output} of shape {stated}", shapes[table.output])
 
     def read(self, tensors: Mapping[str, Floats32], view: View) -> Segmentation:
-        """The lines of one run, drawn into the mask of paint; the network knows no road."""
+        """The lines of one run, drawn into the lane mask; the road mask is empty."""
         lane = np.zeros((view.image_height_px, view.image_width_px), np.uint8)
-        width_px = max(1, round(LINE_REL * view.image_width_px))
+        width_px = max(1, round(LINE_WIDTH_REL * view.image_width_px))
         for points in self.points_px(tensors[self.table.output][0], view):
             cv2.polylines(lane, [np.round(points).astype(np.int32)], False, 1, width_px)
         return Segmentation(road=np.zeros(lane.shape, dtype=bool), lane=lane > 0)
@@ -40,9 +40,9 @@ class RowAnchorsDecoder:
         return part
 
     def points_px(self, logits: Floats32, view: View) -> list[Floats]:
-        """(N, 2) pixels of the image for each line that was found; `logits` (columns + 1, rows, lines).
+        """Image points (N, 2) of each line found; `logits` (columns + 1, rows, lines).
 
-        The column is the mean over the softmax of all columns but the last, which says that the line is not in the row.
+        The column is the mean of the softmax over all columns but the last, which means that the line is absent.
         """
         columns = logits[:-1].astype(np.float64)
         share = np.exp(columns - columns.max(axis=0))
@@ -56,5 +56,5 @@ class RowAnchorsDecoder:
             if len(rows) >= MIN_POINTS:
                 rows = rows[np.argsort(y_px[rows])]
                 points = np.column_stack([x_px[rows, k], y_px[rows]])
-                out.append(view.to_image(np.tile(points, 2))[:, :2] - 0.5)  # from pixels' edges to their centres
+                out.append(view.to_image(np.tile(points, 2))[:, :2] - 0.5)  # from pixel edges to pixel centres
         return out

@@ -1,4 +1,4 @@
-"""Segmentation outputs to masks of the image."""
+"""Decoder of segmentation outputs to masks of the image."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from birdslam.perception.views import View
 
 @dataclass(frozen=True)
 class Segmentation:
-    """Masks (H, W) bool of the undistorted image; all false where the network has no such meaning."""
+    """Masks (H, W) bool of the undistorted image; all false for a meaning that the network lacks."""
 
     road: Bools
     lane: Bools
 
     def above(self, edge_px: Floats) -> Segmentation:
-        """Without what lies below an edge (N, 2) from left to right."""
+        """Clears the masks below an edge (N, 2) from left to right."""
         height, width = self.road.shape
         last = np.interp(np.arange(width), *edge_px.T)
         over = np.arange(height)[:, None] < last
@@ -32,7 +32,7 @@ class ClassMapsDecoder:
     """Reads class channels (see `manifest.ClassMaps`)."""
 
     def __init__(self, table: ClassMaps, input: Input, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        """Raises ManifestMismatch where an output's shape isn't what the manifest makes of it."""
+        """Raises ManifestMismatch if an output's shape isn't what the manifest makes of it."""
         self.table, self.input = table, input
         for index, entry in enumerate(table.maps):
             shape = shapes[entry.output]
@@ -56,9 +56,9 @@ class ClassMapsDecoder:
         return part
 
     def _mask(self, scores: Floats32, entry: ClassMap, view: View) -> Bools:
-        """(H, W): where the margin of the channel over its threshold, resized to the image, is above zero.
+        """Mask (H, W): the pixels where the channel's margin over its threshold, resized to the image, is positive.
 
-        Resizing the margin and not the mask keeps the border smooth at the image's resolution.
+        Resizing the margin rather than the mask keeps the border smooth at the image's resolution.
         """
         chosen = entry.chosen
         channel = scores[chosen[0]] if len(chosen) == 1 else scores[list(chosen)].max(axis=0)

@@ -1,11 +1,11 @@
-"""The records of an ONNX file (a protobuf, onnx.proto), read no further than to find weights."""
+"""Reads the records of an ONNX file (protobuf, onnx.proto) as far as needed to find weights."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
 MODEL_GRAPH, GRAPH_INITIALIZER = 7, 5
-# Of each kind of record that leads to tensors: field -> kind of what lies in it
+# For each kind of record that leads to tensors: field -> kind of its content
 _CONTENTS = {
     "model": {MODEL_GRAPH: "graph", 25: "function"},
     "graph": {1: "node", GRAPH_INITIALIZER: "tensor", 15: "sparse_tensor"},
@@ -19,9 +19,9 @@ _TENSOR_EXTERNAL, _TENSOR_LOCATION = 13, 14
 
 
 def fields(data: bytes | bytearray, at: int, end: int) -> Iterator[tuple[int, int, range, int]]:
-    """(field number, value of a varint, where the bytes of a length-delimited field lie, where it ends) of one record.
+    """(field number, value of a varint, byte range of a length-delimited field, end) of each field of one record.
 
-    Raises ValueError where the bytes are no record.
+    Raises ValueError if the bytes are not a record.
     """
     while at < end:
         key, at = _varint(data, at)
@@ -38,16 +38,16 @@ def fields(data: bytes | bytearray, at: int, end: int) -> Iterator[tuple[int, in
             case 5:  # 32 bits
                 at += 4
             case kind:
-                raise ValueError(f"no ONNX file: wire type {kind} at byte {at}")
+                raise ValueError(f"not an ONNX file: wire type {kind} at byte {at}")
         if at > end:
-            raise ValueError(f"no ONNX file: a record ends at byte {at}, past its container's end at {end}")
+            raise ValueError(f"not an ONNX file: a record ends at byte {at}, past its container's end at {end}")
         yield key >> 3, value, span, at
 
 
 def has_weights_elsewhere(content: bytes) -> bool:
-    """Whether a tensor of the network lies in another file: onnxruntime would read it from wherever the network says.
+    """Whether a tensor of the network is in another file, at a path that the network names.
 
-    Raises ValueError where the bytes are no ONNX file.
+    Raises ValueError if the bytes are not an ONNX file.
     """
     left = [("model", range(len(content)))]
     while left:
@@ -71,4 +71,4 @@ def _varint(data: bytes | bytearray, at: int) -> tuple[int, int]:
             return value, at
         if shift > 63:
             break
-    raise ValueError(f"no ONNX file: a number breaks off at byte {at}")
+    raise ValueError(f"not an ONNX file: a truncated number at byte {at}")

@@ -1,6 +1,6 @@
 """Removes unread outputs from an ONNX file's bytes, with all nodes that only they need, for speed.
 
-onnxruntime computes every node of a graph, also for outputs that are not requested.
+onnxruntime computes every node of a graph, even for outputs that are not requested.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ _DELIMITED = 2  # wire type
 
 
 def without_outputs(content: bytes, unread: Collection[str]) -> bytes:
-    """The same network without the outputs `unread`; what it gives for the others does not change by a bit.
+    """The same network without the outputs `unread`; the other outputs stay bit-identical.
 
-    One whose nodes hold graphs of their own stays whole: those may read anything. `content` must be a network that
-    onnxruntime has read.
+    A network with nested graphs is returned unchanged, since these may read any value. `content` must be a valid ONNX
+    file.
     """
     out = bytearray()
     for number, whole, inside in _records(content, range(len(content))):
@@ -35,10 +35,10 @@ def without_outputs(content: bytes, unread: Collection[str]) -> bytes:
 
 
 def _cut(content: bytes, graph: range, unread: Collection[str]) -> bytes | None:
-    """The graph's record; None where a node holds a graph."""
+    """The graph's record; None if a node contains a graph."""
     records = list(_records(content, graph))
     kept, wanted = [], set[str]()
-    for number, whole, inside in reversed(records):  # nodes stand behind those that they read, outputs behind nodes
+    for number, whole, inside in reversed(records):  # nodes come after those that they read, outputs after nodes
         if number == _GRAPH_OUTPUT:
             name = _texts(content, inside, _OUTPUT_NAME)[0]
             if name in unread:
@@ -58,7 +58,7 @@ def _cut(content: bytes, graph: range, unread: Collection[str]) -> bytes | None:
 
 
 def _records(content: bytes, record: range) -> Iterator[tuple[int, range, range]]:
-    """(field number, the field with its key, what lies in it) of each field of a record."""
+    """(field number, range with the key, range of the content) of each field of a record."""
     at = record.start
     for number, _, inside, end in fields(content, record.start, record.stop):
         yield number, range(at, end), inside

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.arrays import Bools, Floats32
-from birdslam.perception.decoding.multitask import CANONICAL_FOCAL, CLASSES, KINDS
+from birdslam.perception.decoding.multitask import CANONICAL_FOCAL_REL, CLASSES, KINDS
 from birdslam.world.truth import CLASSES as SURFACES
 from birdslam.world.truth import WorldFrame, WorldObject
 
@@ -84,7 +84,7 @@ def encode(frame: WorldFrame, window: Window, width_px: int, height_px: int, con
     masks = np.stack([cv2.resize(mask, half, interpolation=cv2.INTER_AREA) for mask in (road, lane)])
     masks[1] = masks[1] >= config.lane_share
     # Canonical depth: where the point would be under a camera with the canonical focal length
-    zoom = (window.x1_px - window.x0_px) * CANONICAL_FOCAL / frame.camera.fx_px
+    zoom = (window.x1_px - window.x0_px) * CANONICAL_FOCAL_REL / frame.camera.fx_px
     # Its inverse is linear on a plane, so that its mean is the plane's at the cell's centre
     nearness = cv2.resize(np.float32(1.0) / depth_m, half, interpolation=cv2.INTER_AREA) / zoom
     sky = cv2.resize((classes == _SKY).astype(np.uint8), half, interpolation=cv2.INTER_NEAREST) > 0
