@@ -317,7 +317,7 @@ def test_supervisions_boxes_come_back_with_metres_in_columns(seen: Seen) -> None
         assert any(p is not None and p.track == track and p.distance_m == distance_m for p in placed)
     with pytest.raises(ValueError, match="no class_name"):
         supervision_adapter.from_supervision(theirs)
-    with pytest.raises(ValueError, match="1 places for"):
+    with pytest.raises(ValueError, match="1 positions for"):
         supervision_adapter.add_metres(theirs, [None])
 
 

@@ -223,7 +223,7 @@ def test_a_checkpoint_goes_on_with_the_factor(cut: int) -> None:
     late, forgetful = ([g.optimise(m, fixes[m.frame_id]) for m in LOG[cut:]] for g in (restored, graph_with(Gnss())))
     assert [graph.optimise(m, fixes[m.frame_id]) for m in LOG[cut:]] == late
     assert late != forgetful
-    with pytest.raises(CheckpointError, match=r"was made with factors = .*GNSS.*, here it is"):
+    with pytest.raises(CheckpointError, match=r"was written with factors = .*GNSS.*, this graph has"):
         PoseGraph.restore(data, *SETTINGS)
 
 

@@ -526,7 +526,7 @@ def test_the_shipped_network_says_the_same_of_boxes_without_its_masks() -> None:
 
 
 def test_two_heads_of_one_role_are_refused() -> None:
-    with pytest.raises(ValueError, match="each role once"):
+    with pytest.raises(ValueError, match="each role must be unique"):
         Networks([FakeHead("a"), FakeHead("b")], Executor().submit)
     with pytest.raises(ValueError, match="patience_s"):
         Networks([], Executor().submit, patience_s=-1.0)

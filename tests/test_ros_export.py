@@ -16,7 +16,7 @@ from birdslam.loops.map_pose import EarthPose, MapPose, MapState
 from birdslam.ros.bag import Bag, BagError
 from birdslam.ros.bag_writer import BagWriter
 from birdslam.ros.frames import StaticFrames
-from birdslam.ros.parts import UNKNOWN
+from birdslam.ros.parts import UNKNOWN_VARIANCE
 from birdslam.runtime.cli.main import main
 from birdslam.runtime.configuration import Configuration, SourceConfig, dump
 from birdslam.runtime.recording.recording import About, RecordingWriter
@@ -133,7 +133,7 @@ def test_covariances_are_in_the_axes_of_ros(sent: dict[str, list[Any]]) -> None:
     R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     plane = np.ix_((0, 1, 5), (0, 1, 5))
     assert np.abs(cov[plane] - R @ np.reshape(COV, (3, 3)) @ R.T).max() < 1e-12
-    assert [cov[i, i] for i in (2, 3, 4)] == [UNKNOWN] * 3
+    assert [cov[i, i] for i in (2, 3, 4)] == [UNKNOWN_VARIANCE] * 3
 
 
 def test_the_motion_is_the_measured_one_with_its_covariance(sent: dict[str, list[Any]]) -> None:
@@ -142,8 +142,11 @@ def test_the_motion_is_the_measured_one_with_its_covariance(sent: dict[str, list
     assert measured.covariance[0] == pytest.approx(0.04)  # of 1/100 of it in a tenth of a second
     assert measured.covariance[35] == pytest.approx(0.001)
     for unknown in (first, reset):
-        assert (unknown.twist.linear.x, unknown.covariance[0]) == (0.0, UNKNOWN)
-    assert (unmeasured.twist.linear.x, unmeasured.covariance[0]) == (pytest.approx(20 * math.cos(0.1)), UNKNOWN)
+        assert (unknown.twist.linear.x, unknown.covariance[0]) == (0.0, UNKNOWN_VARIANCE)
+    assert (unmeasured.twist.linear.x, unmeasured.covariance[0]) == (
+        pytest.approx(20 * math.cos(0.1)),
+        UNKNOWN_VARIANCE,
+    )
 
 
 def test_vehicles(sent: dict[str, list[Any]]) -> None:
@@ -161,7 +164,7 @@ def test_vehicles(sent: dict[str, list[Any]]) -> None:
     assert (twist.twist.linear.x, twist.twist.linear.y) == pytest.approx((3.0, -1.0))  # it looks to the left of world
     cov = twist.covariance.reshape(6, 6)
     assert cov[:2, :2].ravel() == pytest.approx([0.2, -0.1, -0.1, 0.5])
-    assert cov[5, 5] == UNKNOWN
+    assert cov[5, 5] == UNKNOWN_VARIANCE
     assert moving[1].pose.covariance == pytest.approx(result.pose.covariance)
     placed = IN_ODOM[1] @ SE2(0, 0, 0.1).inverse() @ CAR.T_world_vehicle  # in the second world
     assert matrix(moving[2].pose.pose)[:2, 3] == pytest.approx((placed.x_m, placed.y_m))

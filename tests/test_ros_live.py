@@ -268,11 +268,11 @@ def test_times_of_the_same_clock_are_exact_and_those_of_another_keep_their_inter
 
 def test_what_can_not_be_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any) -> None:
     for arguments, said in (
-        (["ros", "--namespace", "/a b"], "ros.namespace: '/a b' is no topic of ROS"),
+        (["ros", "--namespace", "/a b"], "ros.namespace: '/a b' is not a ROS topic"),
         (["ros", "--router", "nowhere"], "ros.router"),
         (["ros", "--domain", "400"], "ros.domain"),
         (["ros", "--rate", "0"], "--rate 0: needs a positive number"),
-        (["run", "--source", "ros:front/image", "--output", str(tmp_path)], "is no topic of ROS"),
+        (["run", "--source", "ros:front/image", "--output", str(tmp_path)], "is not a ROS topic"),
         (["run", "--source", "ros:/a", "--rate", "max", "--output", str(tmp_path)], 'rate "max" is for recordings'),
     ):
         assert main(arguments) == 2

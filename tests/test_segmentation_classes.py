@@ -49,13 +49,13 @@ def test_logits_are_held_against_a_probability(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("channel", "more", "named"),
     [
-        ("[]", "", "channel: a channel, or a list"),
-        ("[1, 1]", "", "channel: a channel, or a list"),
+        ("[]", "", "channel must be a channel or a list"),
+        ("[1, 1]", "", "channel must be a channel or a list"),
         ("[0, 4]", "", "4 is not one of 4 channels"),
         ("-1", "", "-1 is not one of"),
         ("[0, 1, 2, 3]", "", "argmax"),
-        ("0", "sigmoid = true", "sigmoid: only with rule"),
-        ("0", 'rule = "above"\nsigmoid = true\nthreshold = 1.0', "sigmoid: only with rule"),
+        ("0", "sigmoid = true", "sigmoid needs rule"),
+        ("0", 'rule = "above"\nsigmoid = true\nthreshold = 1.0', "sigmoid needs rule"),
     ],
 )
 def test_a_list_that_makes_no_sense_is_refused(tmp_path: Path, channel: str, more: str, named: str) -> None:

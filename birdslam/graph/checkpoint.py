@@ -1,6 +1,6 @@
-"""A pose graph as bytes, to be taken up by a later process: MessagePack, with a sum over it and its configuration.
+"""Serializes a pose graph for a later process: MessagePack with a checksum and the configuration.
 
-Whole arrays go as their raw bytes, so that a graph taken up again gives the very bytes that it would have given.
+Arrays are stored as raw bytes, so that a restored graph gives bit-identical results.
 """
 
 from __future__ import annotations
@@ -30,29 +30,29 @@ class CheckpointError(ValueError):
 
 
 class Epoch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """All that a graph knows since its world began."""
+    """The state of a graph in its current epoch."""
 
     window: WindowState
     vehicles: list[VehicleNode]
-    factors: dict[str, bytes]  # `packed` states of those that keep something, by their names
+    factors: dict[str, bytes]  # name -> `packed` state of each stateful factor
     t_ns: int
     t_before_ns: int
     motion: SE2
-    people: list[FollowedPerson]  # as the newest measurements have them
-    traffic: TrafficState  # which way the lanes run
+    people: list[FollowedPerson]  # of the newest measurements
+    traffic: TrafficState  # directions of the lanes
 
 
 class Checkpoint(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A graph between two frames; without `begun` it has seen none."""
+    """A graph between two frames; without `begun` before its first frame."""
 
-    settings: dict[str, Any]  # what it was made with, plain
+    settings: dict[str, Any]  # its configuration, plain
     epoch: int
     started: Epoch | None
     pending: PendingState
 
 
 def pack(checkpoint: Checkpoint) -> bytes:
-    """The checkpoint as bytes: a mark with the version, the sum of what follows, and MessagePack."""
+    """The checkpoint as bytes: a magic number with the version, a checksum, and MessagePack."""
     body = _ENCODER.encode(checkpoint)
     return b"".join([_MAGIC, bytes([VERSION]), _sum(body), body])
 
@@ -61,30 +61,30 @@ def unpack(data: bytes, settings: dict[str, Any]) -> Checkpoint:
     """The checkpoint of these bytes, if it was made with the same `settings`. Raises CheckpointError."""
     head = len(_MAGIC) + 1
     if data[: len(_MAGIC)] != _MAGIC:
-        raise CheckpointError("is no checkpoint of a pose graph")
+        raise CheckpointError("is not a checkpoint of a pose graph")
     if data[len(_MAGIC) : head] != bytes([VERSION]):
         raise CheckpointError(f"is a checkpoint of version {[*data[len(_MAGIC) : head]]}, expected [{VERSION}]")
     body = data[head + _SUM_BYTES :]
     if data[head : head + _SUM_BYTES] != _sum(body):
-        raise CheckpointError("is torn: its sum is not that of its content")
+        raise CheckpointError("is damaged: its checksum does not match")
     try:
         checkpoint: Checkpoint = _DECODER.decode(body)
-    except (ValueError, msgspec.DecodeError) as error:  # whole, but made by other code under the same version
+    except (ValueError, msgspec.DecodeError) as error:  # written by other code with the same version
         raise CheckpointError(f"can't be read: {error}") from None
     for name in sorted({*settings, *checkpoint.settings}):
         theirs, ours = checkpoint.settings.get(name), settings.get(name)
         if theirs != ours:
-            raise CheckpointError(f"was made with {name} = {theirs}, here it is {ours}")
+            raise CheckpointError(f"was written with {name} = {theirs}, this graph has {ours}")
     return checkpoint
 
 
 def packed(state: object) -> bytes:
-    """A factor's state, for an `Epoch`."""
+    """Serializes a factor's state, for an `Epoch`."""
     return _ENCODER.encode(state)
 
 
 def unpacked(data: bytes, kind: type) -> Any:
-    """A factor's state of this type. Raises CheckpointError."""
+    """Deserializes a factor's state of this type. Raises CheckpointError."""
     try:
         return msgspec.msgpack.decode(data, type=kind, dec_hook=_decode_array)
     except (ValueError, msgspec.DecodeError) as error:
@@ -92,7 +92,7 @@ def unpacked(data: bytes, kind: type) -> Any:
 
 
 def plain(**structs: msgspec.Struct) -> dict[str, Any]:
-    """Every setting by its full name, "graph.ego_nodes", as it comes back from bytes."""
+    """Every setting by its full name, such as "graph.ego_nodes", as plain values."""
     tree = msgspec.msgpack.decode(msgspec.msgpack.encode(structs))
     return {f"{part}.{name}": value for part, values in tree.items() for name, value in values.items()}
 

@@ -1,7 +1,7 @@
-"""The graph of Eqs. 2-8 in g2o's text format, so that other solvers can take the same edges.
+"""Writes the graph of Eqs. 2-8 in g2o's text format, for other solvers.
 
 `VERTEX_SE2 id x y yaw`, `EDGE_SE2 from to x y yaw` with the upper triangle of the information matrix, in the axes of
-the measured pose; a landmark is a `VERTEX_XY` with an `EDGE_SE2_XY` for each sight (Kuemmerle et al., "g2o: A General
+the measured pose; a landmark is a `VERTEX_XY` with an `EDGE_SE2_XY` per observation (Kuemmerle et al., "g2o: A General
 Framework for Graph Optimization", ICRA 2011). Units are metres and radians.
 """
 
@@ -23,8 +23,10 @@ Node = tuple[str, int, int] | LandmarkKey  # "ego" or "vehicle", which, frame; o
 
 
 def g2o_lines(log: Iterable[Measurements], weights: WeightsConfig) -> Iterator[str]:
-    """Vertices where dead reckoning puts them, and the edges as `weights` has them believed; edges that are none are
-    left out, as the graph leaves them out. The first pose is fixed, and the first after each loss of the odometry."""
+    """Vertices from dead reckoning, and the valid edges with the covariances of `weights`.
+
+    The first pose is fixed, and the first pose after each loss of the odometry.
+    """
     ids: dict[Node, int] = {}
     poses: dict[int, SE2] = {}
     pose, fixed = SE2(), list[int]()
@@ -36,7 +38,7 @@ def g2o_lines(log: Iterable[Measurements], weights: WeightsConfig) -> Iterator[s
         edges, frame = pose_edges(m), m.frame_id
         cc = edges.cc
         if cc is None and not edges.cv and not m.cp and poses:
-            continue  # a frame without a picture has no pose
+            continue  # a frame without an image has no pose
         follows = cc is not None and cc.from_frame in poses
         if cc is not None and follows:
             pose = poses[cc.from_frame] @ cc.T_from_to
@@ -66,7 +68,7 @@ def g2o_lines(log: Iterable[Measurements], weights: WeightsConfig) -> Iterator[s
             numbers = (point.real, point.imag, *np.linalg.inv(cov)[np.triu_indices(2)].tolist())
             yield f"EDGE_SE2_XY {ego} {landmark} {' '.join(repr(float(n)) for n in numbers)}"
 
-    # Last: gtsam's reader, which knows no FIX, takes no edge that comes after one
+    # At the end: gtsam's reader ignores all edges after a FIX, which it does not support
     for ego in fixed:
         yield f"FIX {ego}"
 

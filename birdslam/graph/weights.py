@@ -1,4 +1,4 @@
-"""What the edges of the pose graph weigh: their measured covariances, or the paper's numbers (Eq. 4)."""
+"""Weights of the graph's edges: their measured covariances, or the paper's numbers (Eq. 4)."""
 
 from __future__ import annotations
 
@@ -12,31 +12,30 @@ from birdslam.types import LandmarkKind, Measurements
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 EdgeType = Literal["cc", "cp", "cv", "vv", "lanes"]
 
-NO_WEIGHT = 1e-3  # lambda of an edge that shall not count: not 0, since a graph needs a guess of where a pose is
+NO_WEIGHT = 1e-3  # lambda of an ignored edge; not 0, since the graph needs an initial guess of each pose
 
 
 class WeightsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """`measured`: each edge keeps its own covariance; `paper`: an edge's information is `lambda` times the unit matrix.
 
     `leave_out` names the edge types that do not enter the graph (the ablations of Table 3); "lanes" are the CP edges of
-    lanes, "cp" all. None is the mode's own
-    choice: the paper leaves out nothing; `measured` leaves out VV, which the tracker predicts from the very detections
-    that the CV edges carry, since the graph has a constant-velocity factor of its own, and lanes, which move nothing.
+    lanes, "cp" all CP edges. None is the mode's default: `paper` uses all; `measured` leaves out VV, which the tracker
+    predicts from the detections of the CV edges and a constant-velocity factor replaces, and lanes.
     """
 
     # measured: each edge has its own covariance; paper: the weights below
     mode: Literal["measured", "paper"] = "measured"
     cc: Positive = 10_000.0  # lambda of Eq. 4, as those below
     cp: Positive = 10_000.0  # of landmarks
-    # Of vehicles' CP edges to the landmarks of their frame (Eq. 7 has them of ego and vehicles); None: there are none.
-    # It needs slam.graph.landmark_anchor = "first_sight"
+    # CP edges of vehicles to the landmarks of their frame (Eq. 7); None: no such edges. Needs
+    # slam.graph.landmark_anchor = "first_sight"
     cp_vehicles: Positive | None = None
     cv_near: Positive = 1_000.0  # of a vehicle at the camera
     cv_far: Positive = 10.0  # of a vehicle at cv_far_m and farther
-    cv_far_m: Positive = 60.0  # the paper says that CV weighs less with depth, not where it ends
+    cv_far_m: Positive = 60.0  # the paper states no distance
     vv: Positive = 1.0  # of a vehicle's own motion
-    depth_threshold_m: Positive | None = 20.0  # T of Table 4: landmarks past it are left out; None keeps all
-    leave_out: tuple[EdgeType, ...] | None = None  # edge types that don't enter the graph; None: the mode's own choice
+    depth_threshold_m: Positive | None = 20.0  # T of Table 4: landmarks beyond it are left out; None keeps all
+    leave_out: tuple[EdgeType, ...] | None = None  # edge types that do not enter the graph; None: the mode's default
 
     @property
     def left_out(self) -> tuple[EdgeType, ...]:
@@ -62,10 +61,10 @@ def effective_cov(weight: float, dimensions: int) -> tuple[float, ...]:
 
 
 def weighted(measurements: Measurements, config: WeightsConfig) -> Measurements:
-    """The measurements with the covariances that the graph shall believe.
+    """The measurements with the covariances for the graph.
 
-    Without "cc" the ego's motion stays in the graph as the guess it starts from, 32 m uncertain (`NO_WEIGHT`): other
-    edges alone can't carry a frame that sees no vehicle.
+    Without "cc" the ego's motion remains as an initial guess with a sigma of 32 m (`NO_WEIGHT`): the other edges do not
+    constrain a frame without vehicles.
     """
     out = config.left_out
     threshold_m = config.depth_threshold_m
@@ -79,10 +78,10 @@ def weighted(measurements: Measurements, config: WeightsConfig) -> Measurements:
     cc = measurements.cc
     if config.mode == "paper":
         cp_cov, vv_cov = effective_cov(config.cp, 2), effective_cov(config.vv, 3)  # Eq. 4, here and in the next lines
-        # Each CP edge counts alike, however many there are
+        # Each CP edge has the same weight; their number does not matter
         cp = tuple(replace(edge, cov=cp_cov, shared=None) for edge in cp)
         cv = tuple(
-            # What Eq. 4 says of an edge is all: of its size nothing
+            # Eq. 4 gives the whole covariance; sizes are not used
             replace(edge, cov=effective_cov(config.cv_at(edge.T_ego_vehicle.x_m), 3), sigma_log_height=0.0)
             for edge in cv
         )

@@ -1,1 +1,1 @@
-"""Other libraries' detections and tracks, to and from `BirdSLAM.step`; none of these libraries is imported."""
+"""Adapters for detections and tracks of other libraries; none of these libraries is imported."""

@@ -1,4 +1,4 @@
-"""Norfair's `Detection` and `TrackedObject` in, and our metres in their `.data`."""
+"""Adapter for Norfair: reads `Detection` and `TrackedObject`, writes metric positions to their `.data`."""
 
 from __future__ import annotations
 
@@ -19,16 +19,17 @@ KEY = "birdslam"  # in a detection's data
 def from_norfair(
     objects: Sequence[Any], distorted: Camera | None = None, detector: Family | EdgeSigma = "unknown"
 ) -> Detections:
-    """Boxes of `norfair.Detection` (points (2, 2): two corners), or of `norfair.TrackedObject`, whose ids are kept.
+    """Converts `norfair.Detection` (points (2, 2): two corners) or `norfair.TrackedObject`, whose ids are kept.
 
-    In the same order. `distorted` and `detector` are as of `external_detections`. Raises ValueError for what is no box.
+    The order is kept. `distorted` and `detector` are those of `external_detections`. Raises ValueError for points that
+    are not a box.
     """
     boxes, scores, ids = [], [], []
     for each in objects:
         detection = getattr(each, "last_detection", each)
         points = np.asarray(detection.points, np.float64)
         if points.shape != (2, 2):
-            raise ValueError(f"norfair: a box has two corners (2, 2), this has points {points.shape}")
+            raise ValueError(f"norfair: a box needs two corners (2, 2), got points {points.shape}")
         boxes.append(np.concatenate([points.min(axis=0), points.max(axis=0)]))
         scores.append(1.0 if detection.scores is None else float(np.mean(detection.scores)))
         number = getattr(each, "id", None)
@@ -39,16 +40,16 @@ def from_norfair(
 
 
 def add_metres(objects: Sequence[Any], placed: Sequence[PlacedBox | None]) -> None:
-    """Puts the `PlacedBox` of each, or None, into `data["birdslam"]` of its detection.
+    """Writes the `PlacedBox` of each object, or None, to `data["birdslam"]` of its detection.
 
-    Raises ValueError for other boxes than these, and where the data is something else than a dict.
+    Raises ValueError if the counts differ or the data is not a dict.
     """
     if len(placed) != len(objects):
-        raise ValueError(f"norfair: {len(placed)} places for {len(objects)} boxes")
+        raise ValueError(f"norfair: {len(placed)} positions for {len(objects)} boxes")
     for each, place in zip(objects, placed, strict=True):
         detection = getattr(each, "last_detection", each)
         if detection.data is None:
             detection.data = {}
         if not isinstance(detection.data, dict):
-            raise ValueError(f"norfair: data is a {type(detection.data).__name__}; a dict takes the places")
+            raise ValueError(f"norfair: data is a {type(detection.data).__name__}; it must be a dict")
         detection.data[KEY] = place

@@ -1,6 +1,6 @@
-"""`supervision.Detections` in, and our metres as columns of its `.data`.
+"""Adapter for supervision: reads `supervision.Detections`, writes metric positions to columns of its `.data`.
 
-Results of ultralytics, transformers and others come through it (`supervision.Detections.from_ultralytics`).
+It also covers ultralytics, transformers and others (`supervision.Detections.from_ultralytics`).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ CLASS_NAME = "class_name"  # supervision's own column
 
 
 class SupervisionDetections(Protocol):
-    """What is read of `supervision.Detections`: N boxes."""
+    """The fields of `supervision.Detections` that are read, for N boxes."""
 
     xyxy: Any  # (N, 4) px
     confidence: Any  # (N,) or None
@@ -36,10 +36,10 @@ def from_supervision(
     distorted: Camera | None = None,
     detector: Family | EdgeSigma = "unknown",
 ) -> Detections:
-    """For `BirdSLAM.step`, in the same order; a tracker's ids are kept.
+    """Converts detections for `BirdSLAM.step`, in the same order; a tracker's ids are kept.
 
-    Classes are named by the column `class_name`, or by `names` (class_id -> name). `distorted` and `detector` are as of
-    `external_detections`. Raises ValueError where no class has a name, and for numbers that are none.
+    Class names come from the column `class_name` or from `names` (class_id -> name). `distorted` and `detector` are
+    those of `external_detections`. Raises ValueError if class names are missing or numbers are invalid.
     """
     count = len(detections.xyxy)
     if CLASS_NAME in detections.data:
@@ -55,13 +55,13 @@ def from_supervision(
 
 
 def add_metres(detections: SupervisionDetections, placed: Sequence[PlacedBox | None]) -> None:
-    """Puts what `BirdSLAM.step` says of the same boxes into columns of `detections.data`, one number a box.
+    """Writes the results of `BirdSLAM.step` for the same boxes to columns of `detections.data`, one number per box.
 
-    `x_m`, `y_m` (ahead, left), `distance_m`, `distance_sigma_m`, `speed_mps` and `speed_sigma_mps`: NaN where unknown;
-    `track`: -1 where there is none. Raises ValueError for other boxes than these.
+    `x_m`, `y_m` (ahead, left), `distance_m`, `distance_sigma_m`, `speed_mps` and `speed_sigma_mps` are NaN if unknown;
+    `track` is -1 without a track. Raises ValueError if the counts differ.
     """
     if len(placed) != len(detections.xyxy):
-        raise ValueError(f"supervision: {len(placed)} places for {len(detections.xyxy)} boxes")
+        raise ValueError(f"supervision: {len(placed)} positions for {len(detections.xyxy)} boxes")
     detections.data |= {name: np.array(column) for name, column in columns(placed).items()}
 
 

@@ -1,4 +1,4 @@
-"""Messages of ROS 2 by the library rosbags: made, as CDR and back, and the hash by which ROS tells their types."""
+"""ROS 2 messages with the library rosbags: creation, CDR serialization and type hashes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from birdslam.ros.bag import NEEDS_EXTRA, BagError
 
-# vision_msgs 4, since Humble; rosbags knows the packages of ROS itself alone
+# vision_msgs 4, since Humble; rosbags has only the packages of ROS itself
 VISION_MSGS = {
     "ObjectHypothesis": "string class_id\nfloat64 score",
     "ObjectHypothesisWithPose": "vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose",
@@ -17,13 +17,13 @@ VISION_MSGS = {
     "vision_msgs/BoundingBox3D bbox\nstring id",
     "Detection3DArray": "std_msgs/Header header\nvision_msgs/Detection3D[] detections",
 }
-_ENCAPSULATION_BYTES = 4  # of CDR: which byte order follows
+_ENCAPSULATION_BYTES = 4  # CDR header with the byte order
 
 
 class MessageTypes:
-    """The types of ROS 2 Humble, which are those of all later releases for every message that is used here.
+    """The types of ROS 2 Humble; later releases have the same definitions of all messages used here.
 
-    Raises BagError where rosbags is not installed.
+    Raises BagError if rosbags is not installed.
     """
 
     def __init__(self) -> None:
@@ -37,7 +37,7 @@ class MessageTypes:
         self._zeros: dict[str, tuple[tuple[str, Any], ...]] = {}
 
     def make(self, name: str, /, **fields: Any) -> Any:
-        """A message of its full name, as "nav_msgs/msg/Odometry"; fields that are not given are zero."""
+        """Creates a message by its full name, such as "nav_msgs/msg/Odometry"; missing fields are zero."""
         if name not in self._zeros:
             self._zeros[name] = tuple((field, kind) for field, kind in self.store.fielddefs[name][1])
         for field, kind in self._zeros[name]:
@@ -47,7 +47,7 @@ class MessageTypes:
 
     def _zero(self, kind: Any) -> Any:
         node, value = int(kind[0]), kind[1]
-        if node == 1:  # a number, a truth value or a string
+        if node == 1:  # a number, a bool or a string
             return "" if value[0] == "string" else 0
         if node == 2:  # a message
             return self.make(value)
@@ -57,18 +57,18 @@ class MessageTypes:
         return [self._zero(element) for _ in range(count)]
 
     def cdr(self, message: Any) -> bytes:
-        """A message's bytes."""
+        """Serializes a message."""
         return bytes(self.store.serialize_cdr(message, message.__msgtype__))
 
     def read(self, data: bytes, name: str) -> Any:
-        """The message of these bytes, from whoever sent them. Raises ValueError where they are none of this type."""
+        """Deserializes a message from an untrusted sender. Raises ValueError if it is not of this type."""
         if len(data) < _ENCAPSULATION_BYTES or data[0] != 0 or data[1] not in (0, 1):
-            raise ValueError(f"{len(data)} bytes are no CDR")
+            raise ValueError(f"{len(data)} bytes are not CDR")
         try:
             return self.store.deserialize_cdr(data, name)
-        except Exception as error:  # of bytes that are torn the library raises whatever it stumbles over
-            raise ValueError(f"{len(data)} bytes are no {name}: {error or type(error).__name__}") from None
+        except Exception as error:  # the library raises many types for corrupt bytes
+            raise ValueError(f"{len(data)} bytes are not a {name}: {error or type(error).__name__}") from None
 
     def type_hash(self, name: str) -> str:
-        """RIHS01 of a type (REP-2011), by which ROS since Iron tells whether two sides mean the same."""
+        """RIHS01 hash of a type (REP-2011), by which ROS since Iron compares the types of two endpoints."""
         return self.store.hash_rihs01(name)

@@ -1,8 +1,7 @@
-"""Our records as ROS messages, for a bag or for a live ROS 2; docs/ros.md lists the topics.
+"""Converts records to ROS messages, for a bag or for a live ROS 2; docs/ros.md lists the topics.
 
-Axes are REP-103's as everywhere in types.py. REP-105: `odom` is our world, continued where a new epoch begins (at the
-pose where the last one ended: the motion between is unknown); `base_link` is ego, the camera's foot on the road; `map`
-is the map of places, where the drive has one.
+Axes follow REP-103, frames REP-105: `odom` is the world frame, and a new epoch continues at the last pose of the one
+before; `base_link` is ego, the camera's foot on the road; `map` is the frame of a kept map.
 """
 
 from __future__ import annotations
@@ -55,9 +54,9 @@ TOPICS = {  # topic -> type of its messages
     "/birdslam/fix": "sensor_msgs/msg/NavSatFix",
     "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
 }
-LATCHED = ("/tf_static", "/birdslam/path")  # what comes once must wait for those who come later
+LATCHED = ("/tf_static", "/birdslam/path")  # sent once, also delivered to later subscribers
 
-VEHICLE_HEIGHT_M = 1.5  # of boxes of a height that is not known
+VEHICLE_HEIGHT_M = 1.5  # of boxes of unknown height
 LANE_WIDTH_M = 0.15  # drawn
 CURVE_STEP_M = 2.0  # between two points of a line or a lane
 COLOURS = {LineColour.YELLOW: (1.0, 0.8, 0.0)}  # others are white
@@ -66,9 +65,9 @@ COVARIANCE_KNOWN = 3  # of sensor_msgs/NavSatFix
 
 
 class RosMessages(MessageParts):
-    """Of one drive, in order: it remembers where the last epoch ended and, with `keep_path`, all poses.
+    """Converts the records of one drive, in order; keeps the last pose of each epoch and, with `keep_path`, all poses.
 
-    `frames` stands before the names of all frames ("red/"), so that several cars are in one tree.
+    `frames` is the prefix of all frame names ("red/"), so that several cars can share a tree.
     """
 
     def __init__(self, make: Make, camera: Camera, name: str, keep_path: bool = False, frames: str = "") -> None:
@@ -86,7 +85,7 @@ class RosMessages(MessageParts):
         return "/tf_static", self.make("tf2_msgs/msg/TFMessage", transforms=[mount])
 
     def of_estimate(self, estimate: Estimate, t_ns: int, motion: EgoEdge | None = None) -> Iterator[Sent]:
-        """One frame; `motion` is the ego's since the frame before, as it was measured."""
+        """The messages of one frame; `motion` is the measured ego-motion since the previous frame."""
         before = self._last
         if before is not None and before[0].epoch != estimate.epoch:
             self._T_odom_world = before[1] @ estimate.T_world_ego.inverse()
@@ -110,7 +109,7 @@ class RosMessages(MessageParts):
         yield "/diagnostics", self._diagnostics(estimate, t_ns)
 
     def of_map(self, update: MapUpdate, t_ns: int) -> Iterator[Sent]:
-        """The lane points that the map gained, one marker a lane; none of an epoch that is over."""
+        """The map's new lane points, one marker per lane; nothing for an earlier epoch."""
         if not update.lanes_m or self._last is None or update.epoch != self._last[0].epoch:
             return
         lanes: dict[int, list[Any]] = {}
@@ -122,9 +121,9 @@ class RosMessages(MessageParts):
         yield "/birdslam/lanes", self.make(MARKERS, markers=markers)
 
     def of_map_pose(self, found: MapPose, t_ns: int) -> Iterator[Sent]:
-        """Where `odom` lies in `map`, the ego in it, and on Earth where the map is; of a lost one its diagnostic alone.
+        """The pose of `odom` in `map`, of the ego in `map`, and on Earth if the map is georeferenced.
 
-        None of an epoch that is over. `map` is a plane, as our poses in it are.
+        Only a diagnostic if localization is lost; nothing for an earlier epoch. `map` is planar.
         """
         if self._last is None or found.epoch != self._last[0].epoch:
             return
@@ -133,7 +132,7 @@ class RosMessages(MessageParts):
         yield self.diagnostic("map", level, found.state.value, values, t_ns)
         if found.T_map_odom is None or found.T_odom_ego is None or found.cov is None:
             return
-        T_map_odom = found.T_map_odom @ self._T_odom_world.inverse()  # odometry's world of this epoch lies in `odom`
+        T_map_odom = found.T_map_odom @ self._T_odom_world.inverse()  # the record's odom is the world of this epoch
         joined = self.transform(MAP, ODOM, ego_pose(T_map_odom, Attitude()), t_ns)
         yield "/tf", self.make("tf2_msgs/msg/TFMessage", transforms=[joined])
         T_map_ego = found.T_map_odom @ found.T_odom_ego
@@ -145,7 +144,7 @@ class RosMessages(MessageParts):
             yield "/birdslam/fix", self._fix(found.earth, t_ns)
 
     def _fix(self, earth: EarthPose, t_ns: int) -> Any:
-        """The ego's place on Earth; its height is not known."""
+        """The ego's position on Earth; its altitude is unknown."""
         cov = np.diag([0.0, 0.0, UNKNOWN])
         cov[:2, :2] = np.reshape(earth.cov, (2, 2))
         return self.make(
@@ -155,7 +154,7 @@ class RosMessages(MessageParts):
         )  # fmt: skip
 
     def _lanes(self, lanes: Lanes, t_ns: int) -> Iterator[Sent]:
-        """The lines of one frame, which replace those of the frame before, and the middle of the ego's lane."""
+        """The lines of one frame, which replace those of the previous frame, and the centre of the ego lane."""
         markers = [self.make("visualization_msgs/msg/Marker", header=self.header(BASE, t_ns), action=3)]  # DELETEALL
         for line in lanes.lines:
             points = self._curve(line.y_m, line.seen_from_m, line.to_m)
@@ -181,7 +180,7 @@ class RosMessages(MessageParts):
         ]
 
     def path(self) -> Iterator[Sent]:
-        """The whole path, when the drive is over; nothing without `keep_path`."""
+        """The whole path, after the drive; nothing without `keep_path`."""
         if self._path:
             poses = [
                 self.make("geometry_msgs/msg/PoseStamped", header=self.header(ODOM, t_ns), pose=self.pose(pose))
@@ -241,7 +240,7 @@ class RosMessages(MessageParts):
 
     def _marker(self, lane: int, points: list[Any], t_ns: int) -> Any:
         space = "lane" if lane < 0 else f"lane {lane}"
-        self._markers[space] += 1  # each stays, so that the map grows
+        self._markers[space] += 1  # a new id keeps the earlier markers
         return self._marker_of(ODOM, space, self._markers[space], points, t_ns)
 
     def _marker_of(self, frame: str, space: str, number: int, points: list[Any], t_ns: int) -> Any:
@@ -268,14 +267,14 @@ class RosMessages(MessageParts):
 
 
 def _score(user: RoadUser) -> float:
-    """The probability of its class; 1 where nobody said."""
+    """The probability of its class; 1 if unknown."""
     return 1.0 if user.label_probability is None else user.label_probability
 
 
 def _twist(
     estimate: Estimate, before: tuple[Estimate, SE2] | None, T_odom_ego: SE2, motion: EgoEdge | None
 ) -> tuple[tuple[float, ...], Floats]:
-    """Speed ahead and to the left in m/s, yaw rate in rad/s since the frame before, and their covariance (3, 3)."""
+    """Speed ahead and to the left in m/s, yaw rate in rad/s since the previous frame, and their covariance (3, 3)."""
     unknown = UNKNOWN * np.eye(3)
     if before is None or estimate.t_source_ns <= before[0].t_source_ns or before[0].epoch != estimate.epoch:
         return (0.0, 0.0, 0.0), unknown
@@ -287,5 +286,5 @@ def _twist(
 
 
 def t_of(record: Estimate | MapPose, live: bool) -> int:
-    """The time of a message: UTC of a live camera, else the recording's own clock, as in the bag that it came from."""
+    """The time of a message: UTC for a live camera, else the recording's clock."""
     return record.t_utc_ns if live and record.t_utc_ns else record.t_source_ns

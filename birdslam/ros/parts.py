@@ -1,7 +1,7 @@
-"""What messages of ROS are made of: headers, poses, covariances, transforms and diagnostics.
+"""Parts of ROS messages: headers, poses, covariances, transforms and diagnostics.
 
-Axes are REP-103's as everywhere in types.py. Our covariances are in the body's own axes; ROS has those of a pose in the
-axes of the parent frame, those of a twist in the child's. What is not estimated has the variance UNKNOWN.
+Axes follow REP-103. Covariances of records are in the body's axes; ROS expresses those of a pose in the parent frame,
+those of a twist in the child frame. Quantities that are not estimated have UNKNOWN_VARIANCE.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from birdslam.types import NS_PER_S
 Sent = tuple[str, Any]  # topic, message
 
 MAP, ODOM, BASE, CAMERA = "map", "odom", "base_link", "camera_optical_frame"  # REP-105
-UNKNOWN = 1e6  # variance of what is not estimated
-PLANE = (0, 1, 5)  # x, y and yaw among ROS' six: x, y, z, about x, about y, about z
+UNKNOWN_VARIANCE = 1e6  # of quantities that are not estimated
+PLANE = (0, 1, 5)  # x, y and yaw in ROS' order: x, y, z, about x, about y, about z
 
 
 class Level(enum.IntEnum):
-    """Of diagnostic_msgs/DiagnosticStatus."""
+    """Levels of diagnostic_msgs/DiagnosticStatus."""
 
     OK = 0
     WARN = 1
@@ -34,13 +34,13 @@ class Level(enum.IntEnum):
 
 
 class Make(Protocol):
-    """Makes a message of its full name, as "nav_msgs/msg/Odometry"; fields that are not given are zero."""
+    """Creates a message by its full name, such as "nav_msgs/msg/Odometry"; missing fields are zero."""
 
     def __call__(self, name: str, /, **fields: Any) -> Any: ...
 
 
 class MessageParts:
-    """Makes parts by `make`. `name` is the vehicle's, `frames` stands before the names of all frames ("red/")."""
+    """Creates parts with `make`. `name` is the vehicle's, `frames` the prefix of all frame names ("red/")."""
 
     def __init__(self, make: Make, name: str, frames: str = "") -> None:
         self.make, self._name, self.frames = make, name, frames
@@ -59,16 +59,16 @@ class MessageParts:
         return "/diagnostics", self.make("diagnostic_msgs/msg/DiagnosticArray", header=header, status=[status])
 
     def colour(self, red: float, green: float, blue: float, alpha: float) -> Any:
-        """Of red, green, blue and alpha, each 0 to 1."""
+        """A colour of red, green, blue and alpha, each 0 to 1."""
         return self.make("std_msgs/msg/ColorRGBA", r=red, g=green, b=blue, a=alpha)
 
     def at(self, point: Any) -> Any:
-        """A pose at a point, unturned."""
+        """A pose at a point, without rotation."""
         turn = self.make("geometry_msgs/msg/Quaternion", w=1.0)
         return self.make("geometry_msgs/msg/Pose", position=point, orientation=turn)
 
     def transform(self, parent: str, child: str, T_parent_child: Transform, t_ns: int) -> Any:
-        """`T_parent_child` (4, 4) of frames by their own names."""
+        """A transform `T_parent_child` (4, 4); frame names are without prefix."""
         pose = self.pose(T_parent_child)
         at = pose.position
         moved = self.make(
@@ -80,14 +80,14 @@ class MessageParts:
         )
 
     def header(self, frame: str, t_ns: int) -> Any:
-        """`frame` by its own name; "": none."""
+        """A header for `frame`, a name without prefix; "": no frame."""
         sec, nanosec = divmod(max(t_ns, 0), NS_PER_S)
         stamp = self.make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
         return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame and self.frames + frame)
 
     def pose(self, T: Transform) -> Any:
-        """Of a pose in space (4, 4)."""
-        from scipy.spatial.transform import Rotation  # here, as in trajectory.py
+        """A pose in space from (4, 4)."""
+        from scipy.spatial.transform import Rotation  # imported late: few processes need it
 
         x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True).tolist()
         at_x, at_y, at_z = T[:3, 3].tolist()
@@ -98,7 +98,7 @@ class MessageParts:
         )
 
     def level(self, T: SE2, z_m: float) -> Any:
-        """Of a body on the road, without pitch and roll."""
+        """A pose of a body on the road, without pitch and roll."""
         return self.make(
             "geometry_msgs/msg/Pose",
             position=self.make("geometry_msgs/msg/Point", x=T.x_m, y=T.y_m, z=z_m),
@@ -108,12 +108,12 @@ class MessageParts:
         )
 
     def vector(self, x: float, y: float, z: float) -> Any:
-        """Three numbers."""
+        """A vector."""
         return self.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
 
 
 def rotated(cov: Floats, yaw_rad: float) -> Floats:
-    """A covariance (3, 3) of a body's own axes in those of the frame in which it has this yaw."""
+    """Rotates a covariance (3, 3) from a body's axes to those of the frame in which it has this yaw."""
     c, s = math.cos(yaw_rad), math.sin(yaw_rad)
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     out: Floats = R @ cov @ R.T
@@ -121,7 +121,7 @@ def rotated(cov: Floats, yaw_rad: float) -> Floats:
 
 
 def six(cov: Floats) -> Floats:
-    """(36,) of ROS: x, y, z and the turns about them; what the road leaves out is UNKNOWN."""
-    out = UNKNOWN * np.eye(6)
+    """ROS' covariance (36,) of x, y, z and the rotations about them, with UNKNOWN_VARIANCE off the road plane."""
+    out = UNKNOWN_VARIANCE * np.eye(6)
     out[np.ix_(PLANE, PLANE)] = cov
     return out.ravel()

@@ -1,7 +1,7 @@
-"""How rmw_zenoh_cpp names topics and nodes on zenoh, and what it attaches to a message.
+"""The wire format of rmw_zenoh_cpp: keys of topics, tokens of nodes, attachments of messages.
 
-After its design (docs/design.md there) and what its releases since Jazzy send: topics are keys, presence is shown by
-liveliness tokens, in which `%` stands for `/`; a message is CDR, with its number, time and publisher attached.
+Source: docs/design.md of rmw_zenoh and its releases since Jazzy. Topics are keys; liveliness tokens, in which `%`
+replaces `/`, announce endpoints; a message is CDR with an attachment of sequence number, time and publisher.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import re
 import struct
 from typing import NamedTuple
 
-NO_HASH = "TypeHashNotSupported"  # what Humble has in place of a type's hash
+NO_HASH = "TypeHashNotSupported"  # Humble's placeholder for a type hash
 GID_BYTES = 16
 MAX_DOMAIN = 232  # of ROS 2
 _NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
@@ -21,19 +21,19 @@ _PUBLISHER_PARTS = 13  # of the token of a publisher
 
 
 class Qos(NamedTuple):
-    """Of a publisher or a subscription; deadlines, lifespans and leases stay at ROS' defaults."""
+    """QoS of a publisher or a subscription; deadlines, lifespans and leases are ROS' defaults."""
 
     reliable: bool = True
-    transient_local: bool = False  # who comes late gets the last ones
+    transient_local: bool = False  # late subscribers get the last messages
     depth: int = 10
 
     def token(self) -> str:
-        """As a token has it; what is rmw's default is left out."""
+        """The QoS part of a token, without values at rmw's defaults."""
         return f"{'' if self.reliable else 2}:{1 if self.transient_local else ''}:,{self.depth}:,:,:,,"
 
 
 LATCHED_QOS = Qos(transient_local=True, depth=1)
-SENSOR_QOS = Qos(reliable=False, depth=5)  # fits publishers of either kind
+SENSOR_QOS = Qos(reliable=False, depth=5)  # compatible with reliable and best-effort publishers
 
 
 class Node(NamedTuple):
@@ -45,15 +45,15 @@ class Node(NamedTuple):
     name: str
 
     def token(self) -> str:
-        """By which `ros2 node list` finds it."""
+        """The token by which `ros2 node list` finds the node."""
         return f"{self._of(0, 'NN')}"
 
     def publisher_token(self, number: int, topic: str, type_name: str, type_hash: str, qos: Qos) -> str:
-        """By which `ros2 topic list` finds what it publishes; `number` is the publisher's own in this session."""
+        """The token of a publisher, for `ros2 topic list`; `number` identifies the publisher in this session."""
         return self._endpoint(number, "MP", topic, type_name, type_hash, qos)
 
     def subscription_token(self, number: int, topic: str, type_name: str, type_hash: str, qos: Qos) -> str:
-        """By which publishers learn that somebody listens."""
+        """The token by which publishers discover a subscription."""
         return self._endpoint(number, "MS", topic, type_name, type_hash, qos)
 
     def _endpoint(self, number: int, kind: str, topic: str, type_name: str, type_hash: str, qos: Qos) -> str:
@@ -65,7 +65,7 @@ class Node(NamedTuple):
 
 
 class Publication(NamedTuple):
-    """What the token of somebody's publisher says."""
+    """The content of a publisher's token."""
 
     topic: str
     type_name: str  # sensor_msgs/msg/Image
@@ -73,12 +73,12 @@ class Publication(NamedTuple):
 
 
 def topic_key(domain: int, topic: str, type_name: str, type_hash: str) -> str:
-    """The key that the messages of a topic have."""
+    """The key of a topic's messages."""
     return f"{domain}/{check_topic(topic).lstrip('/')}/{dds_type(type_name)}/{type_hash}"
 
 
 def any_type_key(domain: int, topic: str) -> str:
-    """The key expression of a topic whatever its type."""
+    """The key expression of a topic with any type."""
     return f"{domain}/{check_topic(topic).lstrip('/')}/*/*"
 
 
@@ -88,7 +88,7 @@ def publishers_key(domain: int, topic: str) -> str:
 
 
 def publication_of(token: str) -> Publication | None:
-    """Of a publisher's token; None for what is none."""
+    """Parses a publisher's token; None if it is not one."""
     parts = token.split("/")
     if len(parts) != _PUBLISHER_PARTS or parts[5] != "MP":
         return None
@@ -97,7 +97,7 @@ def publication_of(token: str) -> Publication | None:
 
 
 def type_of_key(key: str) -> str | None:
-    """The type of a message by its key; None for a key of no topic."""
+    """The message type in a key; None if it is not a topic's key."""
     parts = key.split("/")
     return ros_type(parts[-2]) if len(parts) > 3 else None
 
@@ -109,35 +109,35 @@ def dds_type(type_name: str) -> str:
 
 
 def ros_type(name: str) -> str | None:
-    """The way back; None for what is none."""
+    """The inverse of `dds_type`; None if `name` is not a DDS type."""
     match = _TYPE.fullmatch(name)
     return f"{match[1]}/msg/{match[2]}" if match else None
 
 
 def gid(token: str) -> bytes:
-    """A publisher's own number, of its token: the same each time, and nobody else's."""
+    """A publisher's unique id, derived from its token."""
     return hashlib.blake2b(token.encode(), digest_size=GID_BYTES).digest()
 
 
 def attachment(sequence: int, t_ns: int, gid: bytes) -> bytes:
-    """What goes with a message: its number among its publisher's, from 1 on, when it was sent (UTC), and by whom."""
+    """The attachment of a message: its sequence number from 1, the time sent (UTC), and the publisher."""
     return _ATTACHMENT.pack(sequence, t_ns, GID_BYTES, gid)
 
 
 def sequence_of(attached: bytes) -> int | None:
-    """A message's number among its publisher's; None where that is not attached."""
+    """The sequence number in an attachment; None if there is none."""
     return int(_ATTACHMENT.unpack(attached)[0]) if len(attached) == _ATTACHMENT.size else None
 
 
 def check_topic(topic: str) -> str:
-    """`topic` itself. Raises ValueError where it is no full name of ROS: it is to become part of a key."""
+    """Returns `topic`. Raises ValueError if it is not a full ROS name, since it becomes part of a key."""
     if not _NAME.fullmatch(topic):
-        raise ValueError(f"{topic!r} is no topic of ROS: /NAME/NAME of letters, digits and '_'")
+        raise ValueError(f"{topic!r} is not a ROS topic; write /NAME/NAME with letters, digits and '_'")
     return topic
 
 
 def check_namespace(namespace: str) -> str:
-    """As ROS writes it: "/" or "/NAME/NAME"; "" and "red" become "/" and "/red". Raises ValueError."""
+    """The normalized namespace, "/" or "/NAME/NAME"; "" and "red" become "/" and "/red". Raises ValueError."""
     stripped = namespace.strip("/")
     return check_topic(f"/{stripped}") if stripped else "/"
 

@@ -1,1 +1,1 @@
-"""Those around the ego beside the joint graph: people, closest approaches, the road that is hidden."""
+"""The ego's surroundings outside the joint graph: people, closest approaches, hidden road."""

@@ -1,4 +1,4 @@
-"""The parts of the road that vehicles hide from the camera, where somebody could step out.
+"""The parts of the road that vehicles hide from the camera.
 
 The camera is above the origin of the ego. A vehicle of height h at a distance d along a ray hides the road behind it up
 to the ray over its roof: d H / (H - h) for a camera height H, without limit if h >= H.

@@ -1,4 +1,4 @@
-"""The factors of the graph, a module for each: residual, Jacobian, information and the equation's number.
+"""The factors of the graph, one per module: residual, Jacobian, information and the equation's number.
 
-Read `factor` first, then `standard`, which has the list that the graph takes by default.
+Read `factor` first, then `standard`, which lists the default factors.
 """

@@ -1,7 +1,6 @@
-"""Constant velocity, which ties each vehicle's newest pose to the one before: ours, in the place of Eq. 6's VV edges.
+"""Constant-velocity factor between successive poses of a vehicle; it replaces the VV edges of Eq. 6.
 
-A vehicle drives on with its twist (velocity in its own frame), whose variances grow with time: it changes little from
-one interval to the next. The window moves poses and covariances by it (`Window.propagate`).
+The twist (velocity in the vehicle's frame) follows a random walk. `Window.propagate` moves poses and covariances by it.
 """
 
 from __future__ import annotations
@@ -13,12 +12,12 @@ from birdslam.graph.window import Window
 
 
 def twist_growth(config: GraphConfig) -> Triple:
-    """(3,) by how much the variances of a twist (x_mps, y_mps, yaw_radps) grow in a second."""
+    """Growth (3,) of the variances of a twist (x_mps, y_mps, yaw_radps) per second."""
     return config.change_forward_mps**2, config.change_sideways_mps**2, config.change_turn_radps**2
 
 
 class ConstantVelocity(Factor):
-    """Stands before the odometry in the list, which drives the vehicles on."""
+    """Sets the process noise of the twists; precedes the odometry, which propagates the vehicles."""
 
     name = "constant velocity"
     equation = "in place of Eq. 6's VV edges"
@@ -27,5 +26,5 @@ class ConstantVelocity(Factor):
         self._growth = twist_growth(config)
 
     def predict(self, frame: GraphFrame, window: Window) -> None:
-        """How uncertain the twists become by this frame."""
+        """Sets the growth of the twists' variances for this frame."""
         frame.twist_growth = self._growth

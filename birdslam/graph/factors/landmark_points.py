@@ -1,8 +1,8 @@
-"""CP edges: points of the road and stations of lanes in the static map, and what they say of the ego (Eqs. 3 and 7).
+"""CP edges: the ego observes road points and lane stations of the static map (Eqs. 3 and 7).
 
-mapping/landmark_edges.py and mapping/lane_edges.py make the edges. Where X_p of Eq. 3 is, is `LandmarkAnchor`'s choice:
-with the window's key node, or in the world since its first sight. docs/method.md has the reasons. Points and their
-covariances are complex numbers, as in costs.py.
+mapping/landmark_edges.py and mapping/lane_edges.py create the edges. `LandmarkAnchor` selects the frame of X_p in
+Eq. 3: the window's key node, or the world since the first observation (docs/method.md). Points and their covariances
+are complex numbers, as in costs.py.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from birdslam.types import LandmarkEdge, LandmarkKind
 
 LandmarkKey = tuple[LandmarkKind, int]  # each kind has ids of its own
 
-_NOTHING = 0.0, 0.0, 0.0, 0.0  # of a landmark that shares no error
-# What a frame's landmarks share lasts: correlated with itself by .42, .49, .34 from one key frame to the next and by
-# .40, .17, .21 to the one after (0005, 0002, 00): in a sum over key frames its variance counts 1 + 2 (r1 + r2) times
-SHARED_LASTS = 2.3
-_MIN_VARIANCE_M2 = 1e-12  # a landmark without noise must not make the sum singular
+_NOTHING = 0.0, 0.0, 0.0, 0.0  # of a landmark without shared error
+# The shared error of a frame's landmarks is correlated between key frames: 1 + 2 (r1 + r2) with the autocorrelations
+# r1, r2 to the next two key frames
+SHARED_VARIANCE_RATIO = 2.3
+_MIN_VARIANCE_M2 = 1e-12  # keeps the sum regular for a landmark without noise
 
 
 @dataclass(slots=True)
 class Sightings:
     """The landmarks of one frame: points (N,) in ego, means (N,) and deviators (N,) of their covariances.
 
-    `shared` (2, N): how far 1-sigma of the frame's pitch and of its height moves each, which is in these covariances.
+    `shared` (2, N): shift of each by 1-sigma of the frame's pitch and of its height; the covariances include it.
     """
 
     keys: list[LandmarkKey]
@@ -50,10 +50,9 @@ class Sightings:
 
 
 def sightings(edges: tuple[LandmarkEdge, ...]) -> Sightings:
-    """The CP edges as arrays, each landmark once (the last one counts).
+    """The CP edges as arrays, each landmark once (the last edge counts).
 
-    An edge whose covariance is none (not positive definite), less than what it shares, or whose numbers are no road's
-    is left out.
+    Skips edges with a covariance that is not positive definite or less than its shared part, and implausible positions.
     """
     latest = {(e.kind, e.landmark): e for e in edges}
     keys = list(latest)
@@ -72,10 +71,10 @@ def sightings(edges: tuple[LandmarkEdge, ...]) -> Sightings:
 
 
 def landmark_residual(points: Complexes, node: complex, heading: complex, anchored: Complexes) -> Complexes:
-    """(N,) how much further on, in ego, each landmark says that an ego node is.
+    """Residuals (N,) of Eq. 3 in ego: the displacement of an ego node that each landmark implies.
 
-    `points` (N,) are where the landmarks are, in ego, `anchored` (N,) the same landmarks as that node saw them, which
-    stands at `node` with `heading` in ego.
+    `points` (N,) are the landmarks in ego, `anchored` (N,) the same landmarks in the node's frame; `node` and `heading`
+    are the node's pose in ego.
     """
     return points - node - heading * anchored  # Eq. 3
 
@@ -83,11 +82,11 @@ def landmark_residual(points: Complexes, node: complex, heading: complex, anchor
 def sum_of_points(
     residuals: Complexes, means: Floats, deviators: Complexes, shared: Complexes
 ) -> tuple[complex, float, complex]:
-    """N >= 1 unary edges on one translation as one: their centroid weighted by information, and its covariance.
+    """Combines N >= 1 unary edges on one translation: their information-weighted centroid and its covariance.
 
-    Where they share nothing it is exact: the sum over p of the costs of t - residual_p, and the cost of t - centroid,
-    differ by a constant in t. An error that moves the points by a row of `shared` (K, N) moves the centroid by their
-    weighted mean, which no number of points averages away.
+    Exact without shared errors: the sum over p of the costs of t - residual_p and the cost of t - centroid differ by a
+    constant in t. An error that moves the points by a row of `shared` (K, N) moves the centroid by their weighted mean,
+    however many points there are.
     """
     det = means * means - (deviators * deviators.conj()).real
     information, deviation = means / det, -deviators / det
@@ -97,9 +96,9 @@ def sum_of_points(
     centroid = (m * moment - d * moment.conjugate()) / det_sum
     each = information * shared + deviation * shared.conj()
     together = each.sum(axis=1)
-    # Of the weighted sum of residuals: m and d, with what is shared added up as a whole in place of point by point
-    more = 0.5 * (SHARED_LASTS * np.vdot(together, together).real - np.vdot(each, each).real)
-    turned = 0.5 * complex(SHARED_LASTS * (together * together).sum() - (each * each).sum())
+    # m and d of the weighted sum of residuals; the shared part is summed before it is squared
+    more = 0.5 * (SHARED_VARIANCE_RATIO * np.vdot(together, together).real - np.vdot(each, each).real)
+    turned = 0.5 * complex(SHARED_VARIANCE_RATIO * (together * together).sum() - (each * each).sum())
     C, D = m / det_sum, -d / det_sum
     spread, skew = C * C + abs(D) ** 2, 2.0 * C * D
     mean = C + spread * more + (skew * turned.conjugate()).real
@@ -107,7 +106,7 @@ def sum_of_points(
 
 
 class LandmarksState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """All that `LandmarkPoints` keeps; see there."""
+    """The state of `LandmarkPoints`."""
 
     anchored: Sightings
     information: Floats
@@ -117,9 +116,9 @@ class LandmarksState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 
 
 class LandmarkPoints(Factor):
-    """CP edges of the ego to the landmarks of the last frame that had such edges.
+    """CP edges from the ego to known landmarks.
 
-    With key_frame as their anchor only key frames have CP edges; with first_sight all frames do.
+    With the anchor key_frame only key frames have CP edges; with first_sight all frames do.
     """
 
     name = "CP"
@@ -137,19 +136,19 @@ class LandmarkPoints(Factor):
         return len(self._row)
 
     def begin(self) -> None:
-        """No landmarks yet."""
-        self._seen: Sightings | None = None  # of the newest frame; None: its CP edges do not count
+        """Clears the landmarks."""
+        self._seen: Sightings | None = None  # of the newest frame; None: its CP edges are not used
         self._known_now = np.zeros(0, np.int64), np.zeros(0, np.int64)  # `_known` of these
         self._row: dict[LandmarkKey, int] = {}
         self._anchored = sightings(())  # in the ego of the keyframe, or in world
-        # Sums over the frames that each was seen in: information, information times position in world, frames
+        # Sums over the frames with each landmark: information, information times position in world, count
         self._information = np.zeros(0)
         self._moment = np.zeros(0, dtype=np.complex128)
         self._frames = np.zeros(0, dtype=np.int64)
         self._yaw_rad = 0.0  # of the ego in world by the CC edges alone
 
     def state(self) -> LandmarksState:
-        """The landmarks and where they are."""
+        """The landmarks and their positions."""
         return LandmarksState(
             anchored=self._anchored,
             information=self._information,
@@ -159,7 +158,7 @@ class LandmarkPoints(Factor):
         )
 
     def resume(self, state: LandmarksState) -> None:
-        """Goes on from there. Raises ValueError where the arrays do not belong together."""
+        """Restores the state. Raises ValueError if the arrays are inconsistent."""
         points = state.anchored
         parts = (points.points, points.means, points.deviators, state.information, state.moment, state.frames)
         if any(len(part) != len(points.keys) for part in parts):
@@ -169,14 +168,14 @@ class LandmarkPoints(Factor):
         self._information, self._moment, self._frames = state.information, state.moment, state.frames
 
     def predict(self, frame: GraphFrame, window: Window) -> None:
-        """The ego's heading by the CC edges alone."""
+        """Integrates the ego's heading from CC edges only."""
         self._yaw_rad += frame.motion.yaw_rad
 
     def linearise(self, frame: GraphFrame, window: Window) -> Linearised | None:
-        """The frame's edges to known landmarks as one edge on a place: the ego's, or that of the key node.
+        """The frame's edges to known landmarks as one edge on the position of the ego or of the key node.
 
-        A landmark whose squared Mahalanobis distance is past the gate weighs less by the square of the excess. What
-        all landmarks of a frame share, their sum does not average away.
+        A landmark with a squared Mahalanobis distance beyond the gate is down-weighted by the square of the excess. The
+        shared error of a frame's landmarks does not average out.
         """
         seen = self._seen = sightings(frame.measurements.cp) if self._in_world or window.is_keyframe else None
         if seen is None:
@@ -196,7 +195,7 @@ class LandmarkPoints(Factor):
             means = means + self._anchored.means[then]
             deviators = deviators + heading * heading * self._anchored.deviators[then]
             shared = np.concatenate([shared, heading * self._anchored.shared[:, then]])
-        # An outlier is one for which the node's own uncertainty does not account either
+        # The test for outliers includes the node's own uncertainty
         (xx, xy), (_, yy) = node_cov.tolist()
         distances = point_costs(residuals, means + 0.5 * (xx + yy), deviators + complex(0.5 * (xx - yy), xy))  # Eq. 5
         if distances.max() > self._gate:
@@ -206,10 +205,10 @@ class LandmarkPoints(Factor):
         return Linearised([gap.real, gap.imag], place, np.array([[[m + d.real, d.imag], [d.imag, m - d.real]]]))
 
     def known_in_ego(self, window: Window) -> tuple[Complexes, Complexes, complex] | None:
-        """Of the known landmarks that the newest frame sees: where it sees them (k,), and where they are (k,), in ego.
+        """The observed (k,) and the known (k,) positions in ego of the newest frame's known landmarks, and a heading.
 
-        Third the heading in ego, a unit number, of what the frame sees. None where none is known. They must be anchored
-        in the world.
+        The heading in ego, a unit number, is that of the observations. None without known landmarks. Needs landmarks
+        that are anchored in the world.
         """
         if self._seen is None:
             return None
@@ -217,16 +216,16 @@ class LandmarkPoints(Factor):
         return (self._seen.points[now], *self._in_ego(then, window)) if len(now) else None
 
     def _in_ego(self, rows: Ints, window: Window) -> tuple[Complexes, complex]:
-        """Known landmarks in ego, and the heading there of what a frame sees: that of the CC edges alone."""
+        """Known landmarks in ego, and the heading of a frame's observations there, from CC edges only."""
         T = window.world
         there = (self._anchored.points[rows] - complex(T.x_m, T.y_m)) * cmath.exp(-1j * T.yaw_rad)
         return there, cmath.exp(1j * (self._yaw_rad - T.yaw_rad))
 
     def conclude(self, frame: GraphFrame, window: Window) -> None:
-        """Anchors the frame's landmarks, now that the ego is corrected.
+        """Anchors the frame's landmarks at the corrected ego pose.
 
-        A landmark that is out of sight settles: it goes on the map where it was seen in enough frames, at its mean over
-        them, weighted by information. A lane's stations do not: their lane is on the map.
+        A landmark out of sight is added to the map at its information-weighted mean, if it was observed in enough
+        frames. Lane stations are not added, since the map has their lane.
         """
         if self._seen is None:
             return
@@ -257,7 +256,7 @@ class LandmarkPoints(Factor):
         self._anchored = seen
 
     def _known(self, seen: Sightings) -> tuple[Ints, Ints]:
-        """Which of a frame's landmarks are known, and the row where each of these is kept."""
+        """Indices of a frame's landmarks that are known, and their rows in the state."""
         row = self._row
         rows = np.array([row.get(key, -1) for key in seen.keys], dtype=np.int64)
         now = np.flatnonzero(rows >= 0)

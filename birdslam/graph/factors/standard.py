@@ -1,4 +1,4 @@
-"""The factors that the graph has by default: which, and in which order, is data that weights and configuration say."""
+"""The default factors of the graph and their order, by weights and configuration."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from birdslam.graph.weights import WeightsConfig
 
 
 def standard_factors(config: GraphConfig, weights: WeightsConfig) -> list[Factor]:
-    """Eqs. 6 and 7 with our constant velocity, or, without `constant_velocity`, as they are. New ones go to the end."""
+    """Eqs. 6 and 7, with a constant-velocity factor if `constant_velocity`. Append new factors."""
     odometry, detections, landmarks = Odometry(config), VehicleDetections(config), LandmarkPoints(config)
     factors: list[Factor]
     if config.constant_velocity:

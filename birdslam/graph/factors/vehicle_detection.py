@@ -1,4 +1,4 @@
-"""CV edges: where the ego sees a vehicle (Eqs. 2 and 6). Linear in the state, whatever the vehicle's yaw."""
+"""CV edges: the ego observes the pose of a vehicle (Eqs. 2 and 6). Linear in the state."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ OWN_POSE = [*range(POSE.start, POSE.stop)]
 
 
 class VehicleDetections(Factor):
-    """CV edges to vehicles that the window has; those to new ones begin them (vehicles.py)."""
+    """CV edges to vehicles of the window; edges to new vehicles initialize them (vehicles.py)."""
 
     name = "CV"
     equation = "Eqs. 2 and 6"
@@ -30,9 +30,9 @@ class VehicleDetections(Factor):
         self._share, self._memory_s = config.lasting_share, config.lasting_s
 
     def predict(self, frame: GraphFrame, window: Window) -> None:
-        """How much of the errors of the last edges these have, too.
+        """Correlates the lasting errors with those of the previous edges.
 
-        Turns vehicles round whose detection contradicts their heading by more than a right angle.
+        Reverses vehicles whose detection contradicts their heading by more than a right angle.
         """
         edges = frame.associations.cv
         if self._share and edges.rows:
@@ -47,7 +47,7 @@ class VehicleDetections(Factor):
                 window.flip_headings([edges.rows[k] for k in np.flatnonzero(opposed)])
 
     def linearise(self, frame: GraphFrame, window: Window) -> Linearised | None:
-        """Each edge measures the three numbers of its vehicle's pose, with an error of which a share lasts."""
+        """Each edge measures its vehicle's pose (3 numbers); a share of the error is correlated over time."""
         edges = frame.associations.cv
         if not edges.rows:
             return None

@@ -1,9 +1,8 @@
-"""Vehicles' CP edges: where a frame's landmarks say that the vehicles stand which it sees (Eqs. 3 and 7).
+"""CP edges of vehicles: a frame's landmarks locate the vehicles that it shows (Eqs. 3 and 7).
 
-Eq. 7 has a unary edge between "an agent A (ego-camera or vehicle in scene)" and each point. A camera sees the point and
-the vehicle, so that the edge is the difference of the two: what the CV edge says of the vehicle is said again, with
-CP's weight, from landmarks instead of the ego. It is on the vehicle's place in the world, which the window has as ego
-pose and place in ego: both are corrected, after the other factors, so that new vehicles have it too.
+Eq. 7 has a unary edge between "an agent A (ego-camera or vehicle in scene)" and each point. The camera observes both,
+so the edge is their difference: the CV edge again, with CP's weight, relative to landmarks instead of the ego. It
+measures the position in world and corrects ego and vehicle, after all other factors, so that it includes new vehicles.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from birdslam.graph.window import Window
 
 
 class VehicleLandmarks(Factor):
-    """CP edges of vehicles, each of information `weight` (Eq. 4). Stands before `landmarks` in the list."""
+    """CP edges of vehicles, each with information `weight` (Eq. 4). Precedes `landmarks` in the list."""
 
     name = "CP of vehicles"
     equation = "Eqs. 3 and 7"
@@ -48,13 +47,13 @@ class VehicleLandmarks(Factor):
 
 
 def _correct(window: Window, rows: Sequence[int], residuals: Complexes, variance_m2: float, hold: bool) -> None:
-    """Adds edges that each say how much further on, in ego, a vehicle of `rows` (k,) stands: `residuals` (k,), metres.
+    """Applies edges on the positions of the vehicles `rows` (k,): `residuals` (k,) in ego, metres.
 
-    `variance_m2` is each edge's, in either axis; `hold` keeps the ego where it is.
+    `variance_m2` is that of each edge per axis; `hold` keeps the ego fixed.
     """
     k, states, P = len(rows), window.layout.poses[rows], window.P
     at = window.at[window.nodes :][rows]
-    H = np.zeros((2 * k, len(P)))  # how the place in the world goes with the state
+    H = np.zeros((2 * k, len(P)))  # Jacobian of the positions in world
     H[0::2, EGO.start] = H[1::2, EGO.start + 1] = 1.0
     H[0::2, EGO.start + 2], H[1::2, EGO.start + 2] = -at.imag, at.real
     H[2 * np.arange(k), states[:, 0]] = H[2 * np.arange(k) + 1, states[:, 1]] = 1.0

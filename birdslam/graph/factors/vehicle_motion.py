@@ -14,16 +14,16 @@ OWN_TWIST = [*range(TWIST.start, TWIST.stop)]
 
 
 class VehicleMotion(Factor):
-    """Alone, as in Eq. 6: a vehicle's twist in an interval is what its VV edge says, whatever it was before.
+    """VV edges as in Eq. 6, without constant velocity: the VV edge sets the vehicle's twist in an interval.
 
-    Stands before the odometry in the list, which drives the vehicles on.
+    Precedes the odometry in the list, which propagates the vehicles.
     """
 
     name = "VV"
     equation = "Eqs. 2 and 6"
 
     def predict(self, frame: GraphFrame, window: Window) -> None:
-        """The twists of the interval that leads to this frame."""
+        """Sets the twists of the interval up to this frame."""
         edges = frame.associations.vv
         if edges.rows:
             velocity, turn_radps = rate(edges.at, edges.yaw_rad, edges.dt_s)  # Eq. 6: its VV edges
@@ -39,14 +39,14 @@ class MeasuredTwist(Factor):
     of_vehicles = True
 
     def linearise(self, frame: GraphFrame, window: Window) -> Linearised | None:
-        """Each edge measures the three numbers of its vehicle's twist."""
+        """Each edge measures its vehicle's twist (3 numbers)."""
         edges = frame.associations.vv
         if not edges.rows:
             return None
         ahead, measured = np.ones(len(edges.rows), np.complex128), np.exp(1j * edges.yaw_rad)
         velocity, turn_radps = window.velocity[edges.rows], window.turn_radps[edges.rows]
         way, heading, g, d = advance(ahead, velocity, turn_radps, edges.dt_s)
-        J = np.zeros_like(edges.covs)  # of the way by the twist
+        J = np.zeros_like(edges.covs)  # of the displacement with respect to the twist
         J[:, 0, 0] = J[:, 1, 1] = g.real
         J[:, 0, 1], J[:, 1, 0] = -g.imag, g.imag
         J[:, 0, 2], J[:, 1, 2], J[:, 2, 2] = d.real, d.imag, edges.dt_s
