@@ -48,15 +48,15 @@ from birdslam.vehicles.track import EgoFrame, TrackingConfig
 from birdslam.vehicles.tracking import Tracker
 from birdslam.vehicles.vehicle_edges import vehicle_edges
 
-MAX_GAP_NS = 5 * NS_PER_S  # between two frames; tracks and velocities say nothing about a later time
-MEASURED_SIGMA_REL = 0.05  # a height or lens that is known better counts as measured
+MAX_GAP_NS = 5 * NS_PER_S  # between two frames; no filter can predict over a longer time
+MEASURED_SIGMA_REL = 0.05  # a height or lens with a smaller sigma counts as measured
 
 
 class FrontEndConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The parts of the front end."""
 
     odometry: OdometryConfig = OdometryConfig()
-    external: ExternalConfig = ExternalConfig()  # of an external odometry, where its file is given
+    external: ExternalConfig = ExternalConfig()  # of an external odometry, if its file is given
     plausibility: PlausibilityConfig = PlausibilityConfig()
     localisation: LocalisationConfig = LocalisationConfig()
     ground_size: GroundSizeConfig = GroundSizeConfig()
@@ -99,7 +99,7 @@ class EgoMotion(Protocol):
 
 
 class FrontEnd:
-    """One frame in, its `Measurements` out (`measure`). Deterministic; owns no thread."""
+    """Converts a frame to its `Measurements` (`measure`). Deterministic; owns no thread."""
 
     def __init__(
         self,
@@ -122,7 +122,7 @@ class FrontEnd:
         self._start()
 
     def _start(self, first_vehicle: int = 0, first_person: int = FIRST_PERSON) -> None:
-        """Starts all that predicts over time; new road users get ids from these on."""
+        """Creates all parts that predict over time; ids of new road users start at the given numbers."""
         camera, config = self.camera, self.config
         self._dead_reckoning = DeadReckoning(camera, config.static_map.attitude_memory_m)
         self._plausibility = PlausibilityGate(config.plausibility)
@@ -141,13 +141,13 @@ class FrontEnd:
             (self.people,),
         )
         self._present = EgoFrame(-1, 0, SE2())
-        self._last = 0, 0.0, SE2()  # when, the camera's pitch against the level, and T_world_ego
+        self._last = 0, 0.0, SE2()  # time, pitch of the camera relative to the horizon, and T_world_ego
 
     def measure(self, frame: Frame, pending: Pending) -> Measurements:
-        """The edges that one frame gives: CC, CV, VV and CP (Sec. 3.1 and 3.2).
+        """Returns the CC, CV, VV and CP edges of one frame (Sec. 3.1 and 3.2).
 
-        `pending` is awaited after the feature tracking, which runs beside the networks. A frame without an image gives
-        its status alone. Raises ValueError for an image of another size than the camera's.
+        `pending` is awaited after the feature tracking, which runs in parallel with the networks. A frame without an
+        image gives only its status. Raises ValueError if the image size differs from the camera's.
         """
         status = [*frame.status, *self._dropped(frame)]
         if frame.image is None:
@@ -189,9 +189,9 @@ class FrontEnd:
         return self._lanes.view(self._dead_reckoning.T_world_ego)
 
     def _dropped(self, frame: Frame) -> tuple[Status, ...]:
-        """Reports missing frames; restarts after a gap in time, over which no filter can predict.
+        """Reports missing frames; restarts after a gap in time.
 
-        A clock that was set back is a gap too, except where a looped source restarts, whose frame numbers fall.
+        A clock that was set back is a gap too, unless the frame number falls too: then a looped source restarted.
         """
         last, self._last_frame = self._last_frame, frame.frame_id
         since_ns, self._last_t_ns = frame.t_source_ns - self._last_t_ns, frame.t_source_ns
@@ -210,7 +210,7 @@ class FrontEnd:
         self._start(self.vehicles.tracker.next_id, self.people.next_id)
 
     def _move(self, frame: Frame, tracks: Any, perception: Perception) -> tuple[Motion | None, EgoEdge | None]:
-        """The ego's motion in metres and its CC edge; None where no motion to an earlier frame is known."""
+        """The ego's motion in metres and its CC edge; None if the motion since earlier frames is unknown."""
         road = None if perception.segmentation is None else perception.segmentation.road
         motion = self.odometry.estimate(
             tracks, frame.frame_id, frame.t_source_ns, _boxes_px(perception), road, frame.speeds
@@ -225,7 +225,7 @@ class FrontEnd:
     def _localise_vehicles(
         self, frame: Frame, motion: Motion | None, perception: Perception
     ) -> tuple[tuple[VehicleEdge, ...], tuple[MotionEdge, ...]]:
-        """CV and VV edges of this frame's detections, or of late ones, which are of an earlier frame."""
+        """CV and VV edges of this frame's detections, or of late detections of an earlier frame."""
         opened = self._open_frame(frame, motion)
         self._present = opened.ego
         self.vehicles.open_frame(opened)
@@ -239,7 +239,7 @@ class FrontEnd:
         return vehicle_edges(seen, opened.ego, self.vehicles.road.ground, self.camera, self.config.tracking)
 
     def _open_frame(self, frame: Frame, motion: Motion | None) -> OpenFrame:
-        """The ego, and the ground by this frame's image and by the camera's change of pitch since the last frame."""
+        """The ego pose, the ground from this frame's image, and the change of pitch since the last frame."""
         t_source_ns, pitch_rad = frame.t_source_ns, self._dead_reckoning.attitude.pitch_rad
         T_world_ego = self._dead_reckoning.T_world_ego
         (last_ns, last_rad, T_world_last), self._last = self._last, (t_source_ns, pitch_rad, T_world_ego)
@@ -256,7 +256,7 @@ class FrontEnd:
         )
 
     def _map_road(self, frame: Frame) -> tuple[LandmarkEdge, ...]:
-        """CP edges of the corners on the road."""
+        """CP edges of the features on the road."""
         road, (ids, px) = self.vehicles.road, self.odometry.road_tracks
         return landmark_edges(
             ids,
@@ -270,7 +270,7 @@ class FrontEnd:
         )
 
     def _map_lanes(self, frame: Frame, perception: Perception) -> LaneOutput:
-        """Lane points and edges, by this frame's segmentation or an earlier one's."""
+        """Lane points and edges from the latest segmentation."""
         road, age = self.vehicles.road, perception.ages.get("segmenter", 0)
         return self._lanes.map_lanes(
             frame.frame_id,

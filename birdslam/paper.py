@@ -1,7 +1,7 @@
-"""The paper's own choices (Sec. 3), as one configuration of the method: what `method = "paper"` stands for.
+"""The configuration of the paper (Sec. 3), selected by `method = "paper"`.
 
-The rows of the tables that are called *as published* and `--set method=paper` use it too.
-Where the paper states no number, the default stands.
+The rows of the tables that are called *as published* use it too. Numbers that the paper does not state are the
+defaults.
 """
 
 from __future__ import annotations
@@ -16,22 +16,22 @@ from birdslam.vehicles.placement.depth_fusion import PseudoLidarConfig
 from birdslam.vehicles.placement.localisation import LocalisationConfig
 from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
 
-NO_GATE = 1e6  # sigmas: nothing is an outlier
+NO_GATE = 1e6  # sigmas; accepts every edge
 
 PAPER = SlamConfig(
     frontend=FrontEndConfig(
         odometry=OdometryConfig(
             road=RoadScaleConfig(mode="paper")
         ),  # Sec. 3.1: flat earth, a moving median of the scale
-        # Sec. 3.1.3: depth within 20 m, farther Eq. 1 on the bottom edge of the box, on level ground as calibrated
+        # Sec. 3.1.3: depth network within 20 m, beyond it Eq. 1 on the lower edge of the box, on the calibrated plane
         pseudolidar=PseudoLidarConfig(rule="paper"),
         localisation=LocalisationConfig(
-            reach_rel=0.0,  # Eq. 1 gives the point of the road under the bottom edge, not the car's centre
-            overhang_rel=0.0,  # ... and wherever that edge ends: at the tyres or under the body
+            reach_rel=0.0,  # Eq. 1 gives the road point under the lower edge, not the car's centre
+            overhang_rel=0.0,  # regardless of whether the edge is at the tyres or under the body
         ),
         ground_size=GroundSizeConfig(
-            cues=("bottom",),  # the box's height and width say nothing
-            sigma_pitch_rad=1e-6,  # the camera is held to stand as it was calibrated
+            cues=("bottom",),  # the box's height and width are not used
+            sigma_pitch_rad=1e-6,  # the camera's calibrated pose is exact
             pitch_memory_s=1e-3,
             sigma_pitch_step_rad=1e-6,
             sigma_pitch_blind_rad=1e-6,
@@ -45,16 +45,16 @@ PAPER = SlamConfig(
         ),
     ),
     weights=PAPER_WEIGHTS,
-    # Eqs. 5-8: CC, CP, CV and VV edges and nothing else
+    # Eqs. 5-8: only CC, CP, CV and VV edges
     graph=GraphConfig(
         constant_velocity=False,
         detection_gate_sigma=NO_GATE,
         landmark_gate_sigma=NO_GATE,
-        landmark_anchor="first_sight",  # X_p of Eq. 3 is a point of the world, and known
-        correlation_length_m=0.0,  # no error but those of the edges
+        landmark_anchor="first_sight",  # X_p of Eq. 3 is a known point in world
+        correlation_length_m=0.0,  # only the errors of the edges
         zero_velocity_update=False,
         vehicles_move_ego=True,  # all edges of Eq. 8 at once
-        lasting_share=0.0,  # each edge is independent of all others
-        front_back_ambiguity=False,  # a measured yaw counts as it is
+        lasting_share=0.0,  # edges are independent
+        front_back_ambiguity=False,  # the measured yaw is used as is
     ),
 )

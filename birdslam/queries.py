@@ -1,4 +1,4 @@
-"""Records that answer planners' queries for the whole trajectory or map; frames and units as in types.py."""
+"""Replies to planners' queries for the whole trajectory or map; frames and units as in types.py."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class VehiclePath(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Trajectory(msgspec.Struct, frozen=True, kw_only=True):
-    """The trajectories: key poses in world of `epoch`, oldest first, always with the newest.
+    """The trajectories: key poses in world of `epoch`, oldest first, including the newest pose.
 
     Older poses are farther apart (see atlas.AtlasConfig).
     """
@@ -40,7 +40,7 @@ class Trajectory(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MapSnapshot(msgspec.Struct, frozen=True, kw_only=True):
-    """The map: all its points, in world of `epoch`, thinned to one in a cell."""
+    """The map: all its points, in world of `epoch`, one per cell."""
 
     epoch: int
     frame_id: FrameId  # of the newest update
@@ -57,7 +57,7 @@ class MapSnapshot(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class NearbyUser(msgspec.Struct, frozen=True, kw_only=True):
-    """A road user as the ego has it: where it is, and how near it may come."""
+    """A road user relative to the ego: its pose and closest approach."""
 
     vehicle: BodyId  # its number
     label: str  # its class
@@ -67,7 +67,7 @@ class NearbyUser(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Nearby(msgspec.Struct, frozen=True, kw_only=True):
-    """Every road user of the newest estimate, who is `nearby` first, then the soonest: an aid, no safety function."""
+    """All road users of the newest estimate, `nearby` ones first, then by time: an aid, not a safety function."""
 
     epoch: int
     frame_id: FrameId

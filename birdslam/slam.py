@@ -25,8 +25,8 @@ LANES_HZ = 5.0  # default rate of lane detection (`[perceive.schedule]`)
 class SlamConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """All parameters of the method; one setting serves all roads.
 
-    A few are keys of users (docs/configuration.md), the others constants. `birdslam.paper.PAPER` has the paper's
-    choices; `msgspec.structs.replace` changes single fields.
+    Some are configuration keys (docs/configuration.md), the others constants. `birdslam.paper.PAPER` is the paper's
+    configuration; `msgspec.structs.replace` changes single fields.
     """
 
     frontend: FrontEndConfig = FrontEndConfig()
@@ -40,11 +40,10 @@ class SlamConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class BirdSLAM:
     """The whole method in one object (paper, Fig. 2): undistorted frames in, measurements and estimates out.
 
-    The three processes of `birdslam run` run the same front end and the same graph, and get the same bytes at
-    `--rate max`. `networks` find vehicles, road and lanes (`perception.shipped_networks()`, `load_networks`);
-    `lane_head` says how often lanes are detected, and what completes them where something occluded the road;
-    `frustum_network` reads bodies from a depth network's points; `odometry` is an external one in place of that of the
-    images (`odometry.external.ExternalOdometry`). Not thread-safe.
+    The three processes of `birdslam run` use the same front end and graph, with identical results at `--rate max`.
+    `networks` detect vehicles, road and lanes (`perception.shipped_networks()`, `load_networks`); `lane_head` sets the
+    rate of lane detection and the completion of occluded lanes; `frustum_network` estimates bodies from the points of a
+    depth network; `odometry` replaces visual odometry (`odometry.external.ExternalOdometry`). Not thread-safe.
     """
 
     def __init__(
@@ -66,9 +65,9 @@ class BirdSLAM:
         rate_hz: float,
         config: SlamConfig = SlamConfig(),  # noqa: B008
     ) -> BirdSLAM:
-        """With the networks that ship with the package, as `birdslam evaluate odometry` runs it.
+        """Creates it with the shipped networks, as `birdslam evaluate odometry` does.
 
-        `rate_hz` is that of the frames to come: lanes are detected LANES_HZ times a second. Raises ModelError.
+        `rate_hz` is the rate of the frames; lanes are detected LANES_HZ times a second. Raises ModelError.
         """
         completion = shipped_completion(config.frontend.lanes.shape)
         lane_head = LaneHead(completion, every=max(1, round(rate_hz / LANES_HZ)))
@@ -83,14 +82,14 @@ class BirdSLAM:
     def step(
         self, frame: Frame, detections: Detections | None = None
     ) -> tuple[Measurements, Estimate] | tuple[Measurements, Estimate, tuple[PlacedBox | None, ...]]:
-        """One undistorted frame: the networks run beside the feature tracking, then the back end.
+        """Processes one undistorted frame: networks and feature tracking in parallel, then the back end.
 
-        Frames come in the order of their `frame_id` and `t_source_ns`; motion is computed from the latter. Poses are
-        in metres and rad, in the world of `Estimate.epoch` (`types.py` has every frame and unit). Trouble with a frame
-        is a `Status` in both records, and `Estimate.valid` says whether it may be driven by. `detections` of another
-        detector (`perception.external.external_detections`) stand in for the network's; then the third of what is
-        returned says where each box is, in their order. Raises ValueError for an image of another size than the
-        camera's, never for what it shows.
+        Frames must be in the order of `frame_id` and `t_source_ns`; motion is computed from the latter. Poses are in
+        metres and rad, in the world of `Estimate.epoch` (`types.py` defines frames and units). Problems with a frame
+        are a `Status` in both records; `Estimate.valid` states whether the estimate may be used for driving.
+        `detections` of another detector (`perception.external.external_detections`) replace the network's; the third
+        result then has the position of each box, in their order. Raises ValueError if the image size differs from the
+        camera's, never because of its content.
         """
         pending = self.networks.start(frame.frame_id, frame.image, detections=detections)
         measurements = self.frontend.measure(frame, pending)
@@ -102,8 +101,8 @@ class BirdSLAM:
         return measurements, estimate, place_boxes(len(detections), frame.frame_id, tracks, people, estimate)
 
     def map_update(self) -> MapUpdate | None:
-        """The map's new points since the last call, in world: landmarks that left the window, and points of lanes.
+        """New map points in world since the last call: landmarks that left the window, and points of lanes.
 
-        None where there are none.
+        None without new points.
         """
         return self.graph.map_update()

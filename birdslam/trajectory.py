@@ -1,11 +1,11 @@
-"""Trajectory files (KITTI rows, TUM lines), and the conversion between ego and camera poses.
+"""Trajectory files (KITTI rows, TUM lines), and conversion between ego and camera poses.
 
 KITTI rows are `T_first_i` (3, 4) row-major in the axes of the first camera, TUM lines `t[s] x y z qx qy qz qw` in the
 world of `types.py`. The camera is mounted on the ego at a constant `mount` (calibrated height, pitch and roll):
 
     T_world_cam = T(x, y, z; Rz(yaw) Ry(pitch) Rx(roll)) @ T_ego_cam(mount)
 
-The car's pitching is in the attitude. A wrong mount tilts the world but leaves the camera's trajectory as it is.
+The attitude includes the car's pitching. A wrong mount tilts the world but does not change the camera's trajectory.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Transform = Floats  # (..., 4, 4) homogeneous, metres; one or many
 
 def ego_pose(T_world_ego: SE2, attitude: Attitude) -> Transform:
     """`T_world_ego` (4, 4) of a planar pose and its attitude."""
-    from scipy.spatial.transform import Rotation  # here: few processes need it
+    from scipy.spatial.transform import Rotation  # imported late: few processes need it
 
     out = np.eye(4)
     angles = [T_world_ego.yaw_rad, attitude.pitch_rad, attitude.roll_rad]
@@ -35,7 +35,7 @@ def ego_pose(T_world_ego: SE2, attitude: Attitude) -> Transform:
 
 
 def split_pose(T_world_ego: Transform) -> tuple[SE2, Attitude]:
-    """The inverse of `ego_pose`, for a pitch within a quarter turn."""
+    """The inverse of `ego_pose`, for a pitch below a quarter turn."""
     R, (x_m, y_m, z_m) = T_world_ego[:3, :3], T_world_ego[:3, 3]
     yaw_rad = math.atan2(R[1, 0], R[0, 0])
     pitch_rad = math.atan2(-R[2, 0], math.hypot(R[2, 1], R[2, 2]))
@@ -62,20 +62,20 @@ def inverse(T_a_b: Transform) -> Transform:
 
 
 def as_poses(rows: Floats) -> Transform:
-    """(N, 4, 4) of KITTI rows (N, 3, 4)."""
+    """Converts KITTI rows (N, 3, 4) to (N, 4, 4)."""
     out = np.tile(np.eye(4), (len(rows), 1, 1))
     out[:, :3] = rows
     return out
 
 
 def kitti_row(T_first_i: Transform) -> str:
-    """One line of a KITTI pose file, without its end."""
-    return " ".join(f"{number:.9e}" for number in (T_first_i[:3] + 0.0).ravel())  # + 0.0: no negative zeros
+    """One line of a KITTI pose file, without the newline."""
+    return " ".join(f"{number:.9e}" for number in (T_first_i[:3] + 0.0).ravel())  # + 0.0 removes negative zeros
 
 
 def tum_row(t_ns: int, T_world_i: Transform) -> str:
-    """One line of a TUM trajectory, without its end; the time is exact to the nanosecond, qw >= 0."""
-    from scipy.spatial.transform import Rotation  # here: few processes need it
+    """One line of a TUM trajectory, without the newline; the time is exact to the nanosecond, qw >= 0."""
+    from scipy.spatial.transform import Rotation  # imported late: few processes need it
 
     qx, qy, qz, qw = Rotation.from_matrix(T_world_i[:3, :3]).as_quat(canonical=True)
     numbers = " ".join(f"{number + 0.0:.9f}" for number in (*T_world_i[:3, 3], qx, qy, qz, qw))
@@ -89,7 +89,7 @@ def _read_numbers(path: Path, width: int, what: str) -> Floats:
     except OSError as error:
         raise ValueError(f"{path}: can't be read: {error.strerror}") from None
     except UnicodeDecodeError:
-        raise ValueError(f"{path}: is no text file of {what}") from None
+        raise ValueError(f"{path}: is not a text file of {what}") from None
     rows = []
     for number, line in enumerate(lines, start=1):
         if not line.strip() or line.lstrip().startswith("#"):
@@ -99,7 +99,7 @@ def _read_numbers(path: Path, width: int, what: str) -> Floats:
         except ValueError:
             row = []
         if len(row) != width or not all(map(math.isfinite, row)):
-            raise ValueError(f"{path}: line {number} is no {what} ({width} finite numbers): {line[:60]!r}")
+            raise ValueError(f"{path}: line {number} is not a {what} ({width} finite numbers): {line[:60]!r}")
         rows.append(row)
     return np.array(rows, dtype=np.float64).reshape(len(rows), width)
 
@@ -111,18 +111,18 @@ def read_kitti(path: Path) -> Floats:
     skewed = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2), initial=0.0) > 1e-3
     wrong = np.flatnonzero(skewed | (np.linalg.det(R) < 0.0))
     if wrong.size:
-        raise ValueError(f"{path}: pose {wrong[0]} holds no rotation matrix")
+        raise ValueError(f"{path}: pose {wrong[0]} has no valid rotation matrix")
     return rows
 
 
 def read_tum(path: Path) -> tuple[Floats, Transform]:
     """Times (N,) in seconds and poses (N, 4, 4) of a TUM file, comments skipped. Raises ValueError naming the line."""
-    from scipy.spatial.transform import Rotation  # here: few processes need it
+    from scipy.spatial.transform import Rotation  # imported late: few processes need it
 
     rows = _read_numbers(path, 8, "TUM pose")
     wrong = np.flatnonzero(np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1.0) > 1e-3)
     if wrong.size:
-        raise ValueError(f"{path}: pose {wrong[0]} holds no unit quaternion")
+        raise ValueError(f"{path}: pose {wrong[0]} has no unit quaternion")
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     if len(rows):
         poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
@@ -131,13 +131,13 @@ def read_tum(path: Path) -> tuple[Floats, Transform]:
 
 
 class JoinedTrajectory:
-    """The poses of all epochs in the axes of the first: a new epoch continues at the last pose.
+    """Joins the poses of all epochs in the axes of the first: a new epoch continues at the last pose.
 
-    Each epoch has a world of its own, and the motion between two is unknown.
+    Each epoch has its own world; the motion between two epochs is unknown.
     """
 
     def __init__(self, start: Transform | None = None) -> None:
-        """`start`: the first pose; None: it is that of the first epoch's world."""
+        """`start`: the first pose; None: the first pose of the first epoch."""
         self._start = start
         self._epoch: int | None = None
         self.T_first_world: Transform = np.eye(4)  # of the present epoch
@@ -160,7 +160,7 @@ class JoinedTrajectory:
 
 
 class CameraTrajectory:
-    """Ego poses, frame by frame, to camera poses in the axes of the first camera (KITTI)."""
+    """Converts ego poses, frame by frame, to camera poses in the axes of the first camera (KITTI)."""
 
     def __init__(self, mount: GroundPlane) -> None:
         self._T_ego_cam = mount_pose(mount)

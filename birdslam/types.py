@@ -63,7 +63,7 @@ def _check_cov(record: msgspec.Struct, *fields: str) -> None:
 
 
 def _is_sound(total: float, *variances: float) -> bool:
-    """Whether the sum is finite and no variance negative: a fast test before those of each number."""
+    """Whether the sum is finite and no variance negative: a fast check before those of each number."""
     return math.isfinite(total) and min(variances) >= 0.0
 
 
@@ -80,7 +80,7 @@ def check_points(record: msgspec.Struct, *points_m: tuple[float, float]) -> None
 
 
 class SpeedSource(Word):
-    """Where the metres of a frame's motion come from."""
+    """The source of the metric scale of a frame's motion."""
 
     ROAD = "road"  # the road's image, under a camera of known height
     CAR = "car"  # the car's own speed
@@ -91,9 +91,9 @@ class SpeedSource(Word):
 
 
 class Moves(Word):
-    """Whether a vehicle stands or drives, decided with hysteresis."""
+    """Whether a vehicle is stationary or moving, with hysteresis."""
 
-    UNDECIDED = "undecided"  # too little was seen of it
+    UNDECIDED = "undecided"  # too few observations
     STANDING = "standing"  # its velocity is reported as zero
     DRIVING = "driving"
 
@@ -103,7 +103,7 @@ class Moves(Word):
 class SpeedReading(msgspec.Struct, frozen=True, kw_only=True):
     """A reading of the car's own speed, from wheels or another source.
 
-    Plausibility is judged where readings are used: a wrong one is a status, not a malformed record.
+    Plausibility is checked by the consumer: an implausible reading is a status, not a malformed record.
     """
 
     t_ns: int  # its time, by the frames' t_source_ns; in topic `speed` by CLOCK_MONOTONIC, 0: on arrival
@@ -115,9 +115,9 @@ class SpeedReading(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class Frame:
-    """One undistorted image inside a process; on the bus a `FrameRef` stands for it.
+    """One undistorted image inside a process; on the bus a `FrameRef` replaces it.
 
-    `image` is (H, W) grey or (H, W, 3) BGR, uint8; None where the frame reports only its status.
+    `image` is (H, W) grey or (H, W, 3) BGR, uint8; None if the frame reports only its status.
     """
 
     frame_id: int
@@ -130,9 +130,9 @@ class Frame:
 
 
 class FrameRef(msgspec.Struct, frozen=True, kw_only=True):
-    """capture -> perceive: where the pixels of a frame lie in the shared-memory ring.
+    """capture -> perceive: the position of a frame's pixels in the shared-memory ring.
 
-    Without pixels (`slot` = -1) it only reports: an unreadable image, or the end of the source.
+    Without pixels (`slot` = -1) it only reports a status: an unreadable image, or the end of the source.
     """
 
     frame_id: FrameId
@@ -163,10 +163,10 @@ class EgoEdge(msgspec.Struct, frozen=True, kw_only=True, gc=False):
 
 
 class VehicleEdge(msgspec.Struct, frozen=True, kw_only=True, gc=False):
-    """CV: a vehicle seen from the ego in one frame (camera-vehicle edge, Eq. 2).
+    """CV: a vehicle observed from the ego in one frame (camera-vehicle edge, Eq. 2).
 
-    `T_ego_vehicle` is the centre of the footprint; where only the nearest face was seen, it is that face moved back by
-    half of `length_m` along the heading. `box_px` = (x1, y1, x2, y2) of the undistorted image.
+    `T_ego_vehicle` is the centre of the footprint; if only the nearest face is visible, that face shifted by half of
+    `length_m` along the heading. `box_px` = (x1, y1, x2, y2) of the undistorted image.
     """
 
     vehicle: BodyId
@@ -178,12 +178,12 @@ class VehicleEdge(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     box_px: Annotated[tuple[float, ...], msgspec.Meta(min_length=4, max_length=4)] = (0.0, 0.0, 0.0, 0.0)
     length_m: float = 4.0
     width_m: float = 1.7
-    # The size by which it was placed in this frame; the place can be corrected once the size is known better
+    # The size used for its position in this frame; a better size later corrects the position
     log_height: float = 0.0  # of its height in metres
     sigma_log_height: float = 0.0
     depth_per_height: float = 0.0  # derivative of the log of its depth by log_height
-    standing: float = 0.0  # the probability that it stands
-    delay_ns: Annotated[int, msgspec.Meta(ge=0)] = 0  # > 0: seen that long before this frame, and predicted to it
+    standing: float = 0.0  # the probability that it is stationary
+    delay_ns: Annotated[int, msgspec.Meta(ge=0)] = 0  # > 0: age of the observation, which is predicted to this frame
 
     def __post_init__(self) -> None:
         cov, sizes = self.cov, self.length_m + self.width_m + self.log_height + self.sigma_log_height
@@ -195,7 +195,7 @@ class VehicleEdge(msgspec.Struct, frozen=True, kw_only=True, gc=False):
 
 
 class MotionEdge(msgspec.Struct, frozen=True, kw_only=True, gc=False):
-    """VV: a vehicle's own motion between two frames as the tracker predicts it (vehicle-vehicle edge, Eq. 2)."""
+    """VV: a vehicle's motion between two frames, predicted by the tracker (vehicle-vehicle edge, Eq. 2)."""
 
     vehicle: BodyId
     from_frame: FrameId
@@ -213,26 +213,26 @@ class LandmarkKind(enum.IntEnum):
     """The kinds of landmarks of the static map."""
 
     ROAD_POINT = 0  # a feature on the road's surface
-    LANE_STATION = 1  # crossing of a lane with a grid line in world: known across the lane only
+    LANE_STATION = 1  # crossing of a lane with a grid line in world: observable only across the lane
 
 
 _STATION_IDS = 1 << 48  # offset of stations' ids in older records, which have no `kind`
 
 
 class LandmarkEdge(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False):
-    """CP: a landmark of the static map seen from the ego (camera-point edge, Eq. 3), back-projected by Eq. 1.
+    """CP: a landmark of the static map observed from the ego (camera-point edge, Eq. 3), back-projected by Eq. 1.
 
-    `kind` and `landmark` together identify it: each kind has its own numbers.
+    `kind` and `landmark` together identify it: each kind has its own ids.
     """
 
     landmark: BodyId
     frame: FrameId
     x_m: float  # in ego
     y_m: float
-    cov: Cov2  # its own part and what it shares
+    cov: Cov2  # including the shared part
     kind: LandmarkKind = LandmarkKind.ROAD_POINT  # a feature on the road (0) or a station of a lane (1)
-    # (2, 2), row-major: metres by which 1-sigma of the frame's pitch (first column) and of its height moves this and
-    # all other landmarks of the frame together; None: it shares nothing
+    # (2, 2), row-major, metres: shift of this landmark by 1-sigma of the frame's pitch (first column) and height, which
+    # all landmarks of the frame share; None: no shared error
     shared: Cov2 | None = None
 
     def __post_init__(self) -> None:
@@ -250,7 +250,7 @@ class LanePoint(msgspec.Struct, frozen=True, array_like=True, gc=False):
 
     x_m: float
     y_m: float
-    lane: int = -1  # persistent id of its lane; -1: of no known lane
+    lane: int = -1  # persistent id of its lane; -1: unknown
 
     def __post_init__(self) -> None:
         if not math.isfinite(self.x_m + self.y_m):
@@ -258,7 +258,7 @@ class LanePoint(msgspec.Struct, frozen=True, array_like=True, gc=False):
 
 
 class LineKind(Word):
-    """What a line on the road is."""
+    """The type of a line on the road."""
 
     UNKNOWN = "unknown"
     SOLID = "solid"
@@ -270,7 +270,7 @@ class LineKind(Word):
 
 
 class LineColour(Word):
-    """The colour of a painted line, where it is sure."""
+    """The colour of a painted line; unknown if it is not certain."""
 
     UNKNOWN = "unknown"
     WHITE = "white"
@@ -303,7 +303,7 @@ class LaneLine(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     existence: Probability = 1.0  # the probability that it is a line
 
     def y_m(self, x_m: float) -> float:
-        """Where it is `x_m` ahead of the ego."""
+        """y of the line at `x_m` ahead of the ego."""
         rate = self.curvature_rate_per_m2
         return self.offset_m + x_m * (self.slope + x_m * (self.curvature_per_m / 2.0 + x_m * rate / 6.0))
 
@@ -321,17 +321,17 @@ class LaneLine(msgspec.Struct, frozen=True, kw_only=True, gc=False):
 
 
 class Bound(Word):
-    """What a lane's left or right is known by."""
+    """The source of a lane's left or right bound."""
 
     PAINT = "paint"
     EDGE = "edge"  # the road's edge
-    WIDTH = "width"  # neither is seen: the other side's line, and the width of lanes
+    WIDTH = "width"  # neither is visible: from the other side's line and the lane width
 
     NEWER = WIDTH
 
 
 class Lane(msgspec.Struct, frozen=True, kw_only=True, gc=False):
-    """A lane in ego: its centre line, a curve as `LaneLine` has it, and its width."""
+    """A lane in ego: its centre line, a curve like `LaneLine`, and its width."""
 
     offset_m: float  # of the centre line, to the left of the ego
     slope: float
@@ -339,16 +339,16 @@ class Lane(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     curvature_rate_per_m2: float
     cov: Cov4  # (4, 4) of those four
     width_m: float  # at the ego
-    width_slope: float  # by which it grows in a metre ahead
+    width_slope: float  # growth of the width per metre ahead
     width_sigma_m: float
     to_m: float  # x up to which it is known
     left: BodyId | None = None  # the line at its left; None where `left_bound` is WIDTH
     right: BodyId | None = None
     left_bound: Bound = Bound.PAINT
     right_bound: Bound = Bound.PAINT
-    carriageway: bool = False  # no paint divides it: all of the road between its edges, for both directions perhaps
-    oncoming: Probability | None = None  # that its traffic comes towards the ego; None: nothing showed it
-    ends_m: float | None = None  # x where its lines leave no room for a car: it ends or merges; None: not in sight
+    carriageway: bool = False  # without dividing paint: all of the road between its edges, possibly for both directions
+    oncoming: Probability | None = None  # that its traffic is oncoming; None: not observed
+    ends_m: float | None = None  # x where it is too narrow for a car: it ends or merges; None: not in sight
     splits_m: float | None = None  # x where it is as wide as two lanes; None: not in sight
 
     def centre_m(self, x_m: float) -> float:
@@ -378,7 +378,7 @@ class Lane(msgspec.Struct, frozen=True, kw_only=True, gc=False):
 
 
 class LaneChange(Word):
-    """The ego's change of lanes: reported once, in the frame in which the middle of the ego has crossed the line."""
+    """The ego's lane change, reported once: in the frame in which the centre of the ego crosses the line."""
 
     NONE = "none"
     LEFT = "left"
@@ -388,14 +388,14 @@ class LaneChange(Word):
 
 
 class VehicleLane(msgspec.Struct, frozen=True, kw_only=True, gc=False):
-    """In which lane a road user is: probabilities that sum to one, from the covariances of both."""
+    """The lane of a road user: probabilities that sum to one, from the covariances of both."""
 
     vehicle: BodyId  # its number, of a vehicle or a person
     ego_lane: Probability = 0.0
-    left: Probability = 0.0  # in a lane to the left of the ego's that goes the ego's way
+    left: Probability = 0.0  # in a lane to the left of the ego lane, in the ego's direction
     right: Probability = 0.0
-    oncoming: Probability = 0.0  # not in the ego's lane, and driving against the ego's way
-    off_road: Probability = 0.0  # in none of the known lanes, and standing or driving the ego's way
+    oncoming: Probability = 0.0  # not in the ego lane, and moving against the ego's direction
+    off_road: Probability = 0.0  # in no known lane, and stationary or moving in the ego's direction
 
 
 class Leader(msgspec.Struct, frozen=True, kw_only=True, gc=False):
@@ -404,7 +404,7 @@ class Leader(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     vehicle: BodyId
     gap_m: float  # along the lane, from the camera's foot to the vehicle's rear
     gap_sigma_m: float
-    time_gap_s: float | None = None  # at the ego's speed; None while the ego stands
+    time_gap_s: float | None = None  # at the ego's speed; None while the ego is stationary
     probability: Probability = 1.0  # that it is in the ego's lane
 
     def __post_init__(self) -> None:
@@ -420,10 +420,10 @@ class Lanes(msgspec.Struct, frozen=True, kw_only=True):
     change: LaneChange = LaneChange.NONE
     vehicles: tuple[VehicleLane, ...] = ()  # of an `Estimate`
     leader: Leader | None = None  # of an `Estimate`
-    age_ns: Annotated[int, msgspec.Meta(ge=0)] = 0  # source time since the image that lines were last seen in
-    tilt_rad: float = 0.0  # to be added to the pitch of `Ground`: so the lines of that image were parallel
-    road_from_m: float = 0.0  # x from which that image shows the road: nearer is the image's edge, or the own bonnet
-    # Vertical curvature: the road ahead lies x^2 / 2 of it over the plane under the camera; > 0: it rises
+    age_ns: Annotated[int, msgspec.Meta(ge=0)] = 0  # source time since the last image with lines
+    tilt_rad: float = 0.0  # correction of the pitch in `Ground` that made the lines of that image parallel
+    road_from_m: float = 0.0  # min. x of the road visible in that image, limited by its border or the ego's bonnet
+    # Vertical curvature: height x^2 / 2 times this over the plane under the camera; > 0: the road rises
     vertical_curvature_per_m: float = 0.0
 
     @property
@@ -433,18 +433,18 @@ class Lanes(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def left(self) -> Lane | None:
-        """The lane at its left."""
+        """The lane left of the ego lane."""
         return None if not self.ego_index else self.lanes[self.ego_index - 1]
 
     @property
     def right(self) -> Lane | None:
-        """The lane at its right."""
+        """The lane right of the ego lane."""
         if self.ego_index is None or self.ego_index + 1 >= len(self.lanes):
             return None
         return self.lanes[self.ego_index + 1]
 
     def line(self, line: BodyId | None) -> LaneLine | None:
-        """A line by its number."""
+        """The line with this number."""
         return next((found for found in self.lines if found.line == line), None)
 
     def __post_init__(self) -> None:
@@ -453,9 +453,9 @@ class Lanes(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Attitude(msgspec.Struct, frozen=True, kw_only=True):
-    """What SE(2) leaves out: the ego's height and tilt in the world, integrated from image odometry.
+    """The degrees of freedom beyond SE(2): the ego's height and tilt in world, integrated from visual odometry.
 
-    Not in the graph; 6-DoF trajectories are written with it (a graded road, the camera's vibration).
+    Not part of the graph; used for 6-DoF trajectories (a graded road, the camera's vibration).
     """
 
     z_m: float = 0.0  # the ego over the world's plane
@@ -467,10 +467,10 @@ class Attitude(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Ground(msgspec.Struct, frozen=True, kw_only=True):
-    """The camera over the road in this frame, as the front end estimates it (camera.GroundPlane on the wire)."""
+    """The front end's estimate of the camera pose over the road in this frame (camera.GroundPlane on the wire)."""
 
     height_m: float  # of the camera over the road
-    pitch_rad: float = 0.0  # of the camera against the road; > 0: nose down
+    pitch_rad: float = 0.0  # of the camera relative to the road; > 0: nose down
     roll_rad: float = 0.0
 
     def __post_init__(self) -> None:
@@ -478,19 +478,19 @@ class Ground(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class FollowedPerson(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False):
-    """A person or cyclist in one frame, as the front end's filter has followed them until it (people/).
+    """A person or cyclist in one frame, tracked by the front end's filter (people/).
 
-    Place and velocity over the ground are in the axes of this frame's ego. People are filtered outside the graph, which
-    gives them its world and its ego.
+    Position and velocity over the ground are in the axes of this frame's ego. People are filtered outside the graph,
+    which transforms them to world.
     """
 
-    person: BodyId  # its number, which no vehicle has
+    person: BodyId  # its number, distinct from those of vehicles
     x_m: float
     y_m: float
     cov: Cov2
     vx_mps: float  # over the ground
     vy_mps: float
-    velocity_cov: Cov2  # including the probability that they stand
+    velocity_cov: Cov2  # including the probability that they are stationary
     label: str = "pedestrian"
     label_probability: Probability = 1.0
     score: float = 1.0  # of the last box
@@ -500,10 +500,10 @@ class FollowedPerson(msgspec.Struct, frozen=True, kw_only=True, array_like=True,
     child: Probability = 0.0  # the probability of a child's height
     length_m: float = 0.7  # of the footprint
     width_m: float = 0.6
-    standing: Probability = 0.5  # the probability that they stand
+    standing: Probability = 0.5  # the probability that they are stationary
     moves: Moves = Moves.UNDECIDED
-    age_ns: Annotated[int, msgspec.Meta(ge=0)] = 0  # source time since their last box; 0: it is of this frame
-    frames: int = 1  # that they were seen in
+    age_ns: Annotated[int, msgspec.Meta(ge=0)] = 0  # source time since their last box; 0: in this frame
+    frames: int = 1  # number of frames with an observation
 
     def __post_init__(self) -> None:
         cov, u = self.cov, self.velocity_cov
@@ -533,25 +533,25 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
     attitude: Attitude = Attitude()
     ground: Ground | None = None
     scale_sigma_rel: float = 0.0  # 1-sigma of the metric scale as a fraction
-    ages: dict[str, int] = {}  # frames since that of each network's result; 0 is this frame
+    ages: dict[str, int] = {}  # age of each network's result in frames
     status: tuple[Status, ...] = ()
     speed_sources: tuple[SpeedSource, ...] = ()  # where the metres of this frame's motion come from
-    camera_sigma_rel: float = 0.0  # 1-sigma of all lengths together by the camera's height and lens, as a fraction
-    people: tuple[FollowedPerson, ...] = ()  # all that are followed, also those out of sight
-    road_lanes: Lanes | None = None  # None: no line was seen yet
+    camera_sigma_rel: float = 0.0  # 1-sigma of the common scale of all lengths from the camera's height and lens
+    people: tuple[FollowedPerson, ...] = ()  # all tracked people, also those out of sight
+    road_lanes: Lanes | None = None  # None: no line observed yet
 
     def __post_init__(self) -> None:
         check_finite(self, "scale_sigma_rel", "camera_sigma_rel")
 
 
 class Approach(msgspec.Struct, frozen=True, kw_only=True, gc=False):
-    """How near somebody comes to the ego, were both to go on as they move now: an aid, and no safety function.
+    """The closest approach of a road user to the ego at constant velocities: an aid, not a safety function.
 
-    From means and covariances of place and velocity, to first order. `nearby` is a hint to look at: within 5 s they
-    may come within 2 m of the ego's middle, at 2 sigma.
+    From means and covariances of position and velocity, to first order. `nearby`: within 5 s the distance to the ego's
+    centre may be below 2 m, at 2 sigma.
     """
 
-    time_s: float  # until the closest approach; 0: they part
+    time_s: float  # until the closest approach; 0: the distance grows
     sigma_s: float
     distance_m: float  # of the centres then
     sigma_m: float
@@ -563,10 +563,10 @@ class Approach(msgspec.Struct, frozen=True, kw_only=True, gc=False):
 
 
 class RoadUser(msgspec.Struct, frozen=True, kw_only=True, gc=False):
-    """One road user in an `Estimate`, of whatever class: pose and velocity over the ground, in world.
+    """One road user of any class in an `Estimate`: pose and velocity over the ground, in world.
 
-    `label` is car, van, truck, bus, trailer, motorcycle (with who rides it), cyclist (bicycle and rider) or pedestrian.
-    A person that does not move has no yaw: its variance is that of an unknown one.
+    `label` is car, van, truck, bus, trailer, motorcycle (with rider), cyclist (bicycle and rider) or pedestrian. A
+    stationary person has an unknown yaw, with the variance of a uniform distribution.
     """
 
     vehicle: BodyId  # its number, for as long as it is followed
@@ -590,12 +590,12 @@ class RoadUser(msgspec.Struct, frozen=True, kw_only=True, gc=False):
 
     @property
     def in_sight(self) -> bool:
-        """Seen within IN_SIGHT_NS: networks need not run on every frame."""
+        """Observed within IN_SIGHT_NS; networks need not run on every frame."""
         return self.age_ns <= IN_SIGHT_NS
 
     @property
     def seen(self) -> bool:
-        """In this very frame; else it is predicted."""
+        """Observed in this frame; otherwise predicted."""
         return self.age_ns == 0
 
     @property
@@ -612,14 +612,11 @@ class RoadUser(msgspec.Struct, frozen=True, kw_only=True, gc=False):
             _check_cov(self, "cov", "velocity_cov")
 
 
-VehicleEstimate = RoadUser  # its name before people were road users
+VehicleEstimate = RoadUser  # an alias for existing code
 
 
 class HiddenFan(msgspec.Struct, frozen=True, kw_only=True, gc=False):
-    """Road that the camera can't see for a vehicle before it: a polygon in ego, in m, counter-clockwise.
-
-    Somebody could step out of it.
-    """
+    """Road that a vehicle hides from the camera: a polygon in ego, in m, counter-clockwise."""
 
     vehicle: BodyId  # behind whom
     x_m: tuple[float, ...]  # of its corners

@@ -21,7 +21,7 @@ from birdslam.bench.baselines.posegraph3 import BatchConfig
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.planar import between
 from birdslam.geometry.se2 import SE2
-from birdslam.graph.factors.landmark_points import SHARED_LASTS, LandmarkPoints, sum_of_points
+from birdslam.graph.factors.landmark_points import SHARED_VARIANCE_RATIO, LandmarkPoints, sum_of_points
 from birdslam.graph.factors.standard import standard_factors
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
@@ -416,7 +416,7 @@ def test_what_landmarks_share_does_not_average_away() -> None:
     _, mean, deviator = sum_of_points(*points, S[..., 0] + 1j * S[..., 1])
     W = np.linalg.inv(covs)
     C, moved = np.linalg.inv(W.sum(axis=0)), np.einsum("nij,knj->ik", W, S)
-    expected = C @ (np.einsum("nij,njk,nkl->il", W, own, W) + SHARED_LASTS * moved @ moved.T) @ C
+    expected = C @ (np.einsum("nij,njk,nkl->il", W, own, W) + SHARED_VARIANCE_RATIO * moved @ moved.T) @ C
     found = np.array([[mean + deviator.real, deviator.imag], [deviator.imag, mean - deviator.real]])
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 

@@ -58,7 +58,7 @@ class GraphConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     zero_velocity_update: bool = True  # a stationary car keeps its pose; False: it follows its CC edges
     # Frames without an image
     blind_mps: Positive = 1.0  # 1-sigma of the ego's velocity around the last one measured
-    blind_radps: Positive = 0.1  # the same of its yaw rate
+    blind_radps: Positive = 0.1  # the same for its yaw rate
 
 
 def check_together(graph: GraphConfig, weights: WeightsConfig) -> None:
