@@ -96,7 +96,7 @@ def self_calibrate(
     `focal_px` and its sigma are the prior. If it is `by_view`, from a field of view, the view may include the lens's
     distortion or not; the sigma of the distortion covers both. The focal length trades against rotation and lateral
     motion in a narrow valley, so several initial values are tried. `bend`: of a pinhole by vertical edges
-    (uprights.py), with its 1-sigma.
+    (vertical_edges.py), with its 1-sigma.
     """
     k1_prior = 0.0, SIGMA_K1
     if bend is not None and not fisheye:

@@ -22,7 +22,7 @@ from birdslam.ros.parts import (
     CAMERA,
     MAP,
     ODOM,
-    UNKNOWN,
+    UNKNOWN_VARIANCE,
     Level,
     Make,
     MessageParts,
@@ -145,7 +145,7 @@ class RosMessages(MessageParts):
 
     def _fix(self, earth: EarthPose, t_ns: int) -> Any:
         """The ego's position on Earth; its altitude is unknown."""
-        cov = np.diag([0.0, 0.0, UNKNOWN])
+        cov = np.diag([0.0, 0.0, UNKNOWN_VARIANCE])
         cov[:2, :2] = np.reshape(earth.cov, (2, 2))
         return self.make(
             TOPICS["/birdslam/fix"], header=self.header(BASE, t_ns), latitude=earth.latitude_deg,
@@ -196,7 +196,7 @@ class RosMessages(MessageParts):
         c, s = math.cos(vehicle.T_world_vehicle.yaw_rad), math.sin(vehicle.T_world_vehicle.yaw_rad)
         R_vehicle_world = np.array([[c, s], [-s, c]])
         vx, vy = (R_vehicle_world @ vehicle.velocity_mps).tolist()
-        twist_cov = np.diag([0.0, 0.0, UNKNOWN])
+        twist_cov = np.diag([0.0, 0.0, UNKNOWN_VARIANCE])
         twist_cov[:2, :2] = R_vehicle_world @ np.reshape(vehicle.velocity_cov, (2, 2)) @ R_vehicle_world.T
         return self._odometry(f"{kind}_{vehicle.vehicle}", pose, cov, (vx, vy, 0.0), twist_cov, t_ns)
 
@@ -275,7 +275,7 @@ def _twist(
     estimate: Estimate, before: tuple[Estimate, SE2] | None, T_odom_ego: SE2, motion: EgoEdge | None
 ) -> tuple[tuple[float, ...], Floats]:
     """Speed ahead and to the left in m/s, yaw rate in rad/s since the previous frame, and their covariance (3, 3)."""
-    unknown = UNKNOWN * np.eye(3)
+    unknown = UNKNOWN_VARIANCE * np.eye(3)
     if before is None or estimate.t_source_ns <= before[0].t_source_ns or before[0].epoch != estimate.epoch:
         return (0.0, 0.0, 0.0), unknown
     dt_s = (estimate.t_source_ns - before[0].t_source_ns) / NS_PER_S

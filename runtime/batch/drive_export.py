@@ -56,15 +56,15 @@ def export_drive(drive: Path, form: str, output: Path, images: str = "", spacing
     """
     if not drive.is_dir():
         raise ResultsError(
-            f"{drive}: expected the folder of a drive (birdslam run --output); "
-            "of a recording, `birdslam replay FILE.mcap --output DIR` writes one"
+            f"{drive}: is not the folder of a drive; birdslam run --output writes one, "
+            "for a recording birdslam replay FILE.mcap --output DIR"
         )
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise ResultsError(f"{output}: exists already; name a new file or directory")
     try:
         if form == "geojson":
             if not (drive / GEOJSON).is_file():
-                raise ResultsError(f"{drive}: has no place on Earth; run the drive with --gnss")
+                raise ResultsError(f"{drive}: has no position on Earth; run the drive with --gnss")
             shutil.copyfile(drive / GEOJSON, output)
             return [f"{output}: the trajectory on Earth"]
         poses = read_poses(drive)
@@ -80,7 +80,7 @@ def export_drive(drive: Path, form: str, output: Path, images: str = "", spacing
 
 
 def read_poses(drive: Path) -> DrivePoses:
-    """Reads the camera poses of a drive's folder; the smoothed ones where there are. Raises ResultsError."""
+    """Reads the camera poses of a drive's folder, smoothed ones if available. Raises ResultsError."""
     try:
         settings: dict[str, Any] = msgspec.json.decode((drive / "summary.json").read_bytes())["configuration"]
         camera = msgspec.convert(settings["camera"], Camera)
@@ -103,7 +103,7 @@ def read_poses(drive: Path) -> DrivePoses:
 
 
 def _posed_images(poses: DrivePoses, output: Path, images: str, spacing_m: float) -> PosedImages:
-    """Writes the images to `output`, one every `spacing_m`, and tracks their corners."""
+    """Writes the images to `output`, one every `spacing_m`, and tracks their features."""
     (output / "images").mkdir(parents=True, exist_ok=True)
     camera = msgspec.structs.replace(poses.camera, distortion=(), fisheye=False)
     posed, tracker = PosedImages(camera), FeatureTracker(camera.width_px, camera.height_px, FeatureConfig())
@@ -121,7 +121,7 @@ def _posed_images(poses: DrivePoses, output: Path, images: str, spacing_m: float
         px = np.asarray(tracks.px, np.float64)
         posed.add(PosedImage(name, frame.t_source_ns, T_world_cam, tracks.ids, px), frame.image)
     if not posed.images:
-        raise DatasetError(f"{images or poses.uri}: has no frame at the times of this drive; --images names its source")
+        raise DatasetError(f"{images or poses.uri}: has no frame at the times of this drive; name one with --images")
     return posed
 
 
@@ -131,7 +131,7 @@ def _frames(poses: DrivePoses, images: str) -> Iterator[Frame]:
     try:
         recording = open_recorded(uri, poses.camera, poses.stride)
     except DatasetError as error:
-        raise DatasetError(f"{error}; --images names the source of the frames") from None
+        raise DatasetError(f"{error}; name the source of the frames with --images") from None
     last_us = max(poses.T_world_cam)
     for frame in with_progress(recording.undistorted_frames(), "export", len(recording) or None):
         if frame.t_source_ns > last_us * _NS_PER_US + NS_PER_S:
@@ -140,4 +140,4 @@ def _frames(poses: DrivePoses, images: str) -> Iterator[Frame]:
 
 
 def _left_out(poses: DrivePoses) -> list[str]:
-    return [f"left out: {poses.left_out} frames that are not valid or of another epoch"] * (poses.left_out > 0)
+    return [f"left out: {poses.left_out} frames that are invalid or of another epoch"] * (poses.left_out > 0)

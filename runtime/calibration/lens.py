@@ -15,7 +15,12 @@ from birdslam.calibration.lens import WIDE_SIGMA_REL, k1_by_bend, self_calibrate
 from birdslam.calibration.lens_adjustment import IMAGES, SIGMA_K1
 from birdslam.calibration.lens_windows import CornersOfImage, track_corners
 from birdslam.calibration.travel import TravelPitch
-from birdslam.calibration.uprights import MAX_IMAGES, LensByVerticalEdges, find_vertical_edges, lens_by_vertical_edges
+from birdslam.calibration.vertical_edges import (
+    MAX_IMAGES,
+    LensByVerticalEdges,
+    find_vertical_edges,
+    lens_by_vertical_edges,
+)
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.runtime.calibration.given import FocalLength, Given, focal_length_of
@@ -50,10 +55,10 @@ def lens_of_drive(
     camera = Camera(width_px, height_px, focal_px, focal_px, *middle, height_m=given.height_m or UNKNOWN_HEIGHT_M)
     edges: list[Floats] = []
     corners = corners_of_drive(configuration, uri, camera, stride, edges)
-    uprights = lens_by_vertical_edges(edges)
-    known = with_uprights(known, uprights, width_px)
+    vertical = lens_by_vertical_edges(edges)
+    known = focal_by_vertical_edges(known, vertical, width_px)
     focal_px, sigma_rel, by = known.px, known.sigma_rel, known.by
-    bend = None if uprights is None or known.fisheye else (uprights.bend, uprights.bend_sigma)
+    bend = None if vertical is None or known.fisheye else (vertical.bend, vertical.bend_sigma)
     lens = self_calibrate(corners, size_px, focal_px, sigma_rel, known.by_view, known.fisheye, bend)
     if lens is None and not must_show and len(corners) >= IMAGES:
         k1 = 0.0 if bend is None else k1_by_bend(bend, focal_px / width_px)[0]
@@ -80,7 +85,7 @@ def lens_of_drive(
             "the images have too little texture; name a lens with --intrinsics, --chessboard or --camera"
         )
     focal = f"focal length {lens.focal_px:.0f} px +- {lens.focal_sigma_rel:.0%}"
-    lines = f", {uprights.edges} vertical edges" if bend is not None and uprights is not None else ""
+    lines = f", {vertical.edges} vertical edges" if bend is not None and vertical is not None else ""
     shown = "by the drive" if lens.focal_shown else f"{by}; the drive turns too little to estimate it"
     found = Intrinsics(
         fx_px=lens.focal_px,
@@ -124,10 +129,10 @@ def corners_of_drive(
         return track_corners(images(), raw)
 
 
-def with_uprights(known: FocalLength, uprights: LensByVerticalEdges | None, width_px: int) -> FocalLength:
+def focal_by_vertical_edges(known: FocalLength, vertical: LensByVerticalEdges | None, width_px: int) -> FocalLength:
     """Returns the focal length from a fisheye's vertical edges, if the field of view is unknown."""
-    if uprights is None or uprights.fisheye_focal is None or known.fisheye or known.sigma_rel < WIDE_SIGMA_REL:
+    if vertical is None or vertical.fisheye_focal is None or known.fisheye or known.sigma_rel < WIDE_SIGMA_REL:
         return known
-    degrees = np.degrees(1.0 / uprights.fisheye_focal)
-    by = f"that of a fisheye {degrees:.0f} deg across, from {uprights.edges} vertical edges"
-    return FocalLength(uprights.fisheye_focal * width_px, WIDE_SIGMA_REL, by, by_view=False, fisheye=True)
+    degrees = np.degrees(1.0 / vertical.fisheye_focal)
+    by = f"that of a fisheye {degrees:.0f} deg across, from {vertical.edges} vertical edges"
+    return FocalLength(vertical.fisheye_focal * width_px, WIDE_SIGMA_REL, by, by_view=False, fisheye=True)

@@ -1,4 +1,4 @@
-"""`birdslam completion SHELL`: what a shell evaluates to complete commands, options and files, by argcomplete."""
+"""`birdslam completion SHELL`: prints the shell code that completes commands, options and files (argcomplete)."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from birdslam.runtime.configuration import ConfigurationError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Adds the shell."""
+    """Adds the argument `shell`."""
     parser.add_argument(
         "shell", choices=("bash", "zsh", "fish"), help='in its start file: eval "$(birdslam completion bash)"'
     )
 
 
 def run(options: argparse.Namespace) -> int:
-    """Prints the completion."""
+    """Prints the completion code."""
     try:
         from argcomplete.shell_integration import shellcode
     except ImportError:

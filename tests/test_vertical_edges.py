@@ -1,4 +1,4 @@
-"""A lens by what is upright in the world: distortion from edges of houses and poles, in images of one drive."""
+"""Lens distortion from vertical edges of houses and poles, in images of one drive."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from birdslam.calibration.lens import FIELD_OF_VIEW_DEG, WIDE_SIGMA_REL, k1_by_bend
 from birdslam.calibration.lens_adjustment import SIGMA_K1
-from birdslam.calibration.uprights import LensByVerticalEdges, find_vertical_edges, lens_by_vertical_edges
+from birdslam.calibration.vertical_edges import LensByVerticalEdges, find_vertical_edges, lens_by_vertical_edges
 from birdslam.runtime.calibration.given import FocalLength
-from birdslam.runtime.calibration.lens import with_uprights
+from birdslam.runtime.calibration.lens import focal_by_vertical_edges
 
 Floats = NDArray[np.float64]
 FOCAL = 0.65  # in image widths
@@ -21,12 +21,12 @@ WIDTH_PX = 1000
 
 
 def street(focal: float, k1: float = 0.0, fisheye: bool = False, roll_rad: float = 0.0, seed: int = 0) -> list[Floats]:
-    """Edges of 12 images: upright ones of a street seen by this lens, each with noise, and a third that lean."""
+    """Edges in 12 images of a street through this lens: vertical ones with noise, and a third that lean."""
     rng = np.random.default_rng(seed)
     out = []
     for _ in range(12):
         n = 60
-        x = np.repeat(rng.uniform(-1.3, 1.3, n), 2).reshape(n, 2)  # of the upright line, at unit distance
+        x = np.repeat(rng.uniform(-1.3, 1.3, n), 2).reshape(n, 2)  # of the vertical line, at unit distance
         low = rng.uniform(-0.75, 0.0, n)
         ends = np.stack([x, np.stack([low - rng.uniform(0.06, 0.15, n), low], axis=1)], axis=-1)
         ends[: n // 3, 0, 0] += rng.normal(0.0, 0.03, n // 3)
@@ -41,7 +41,7 @@ def street(focal: float, k1: float = 0.0, fisheye: bool = False, roll_rad: float
 
 @given(st.floats(-0.3, 0.05), st.floats(-0.03, 0.03), st.integers(0, 3))
 @settings(max_examples=8, deadline=None)
-def test_a_straight_drive_shows_the_distortion_within_its_sigma(k1: float, roll_rad: float, seed: int) -> None:
+def test_straight_drive_gives_distortion_within_sigma(k1: float, roll_rad: float, seed: int) -> None:
     found = lens_by_vertical_edges(street(FOCAL, k1, roll_rad=roll_rad, seed=seed))
     assert found is not None
     assert abs(found.bend - k1 / FOCAL**2) < 3.0 * found.bend_sigma
@@ -50,28 +50,28 @@ def test_a_straight_drive_shows_the_distortion_within_its_sigma(k1: float, roll_
 
 
 @pytest.mark.parametrize("focal", [0.48, 0.42])
-def test_a_fisheye_is_told_with_its_focal_length(focal: float) -> None:
+def test_fisheye_and_its_focal_length_are_estimated(focal: float) -> None:
     found = lens_by_vertical_edges(street(focal, fisheye=True))
     assert found is not None
     assert found.fisheye_focal is not None
     assert found.fisheye_focal == pytest.approx(focal, rel=WIDE_SIGMA_REL)
 
 
-def test_what_looks_like_a_fisheye_of_a_hundred_degrees_may_be_a_pinhole_with_distortion() -> None:
+def test_narrow_fisheye_is_not_distinguished_from_distorted_pinhole() -> None:
     found = lens_by_vertical_edges(street(0.57, fisheye=True))
     assert found is not None
     assert found.fisheye_focal is None
 
 
-def test_few_edges_say_nothing() -> None:
+def test_too_few_edges_give_no_lens() -> None:
     assert lens_by_vertical_edges([]) is None
     assert lens_by_vertical_edges([edges[:2] for edges in street(FOCAL)]) is None
 
 
-def test_edges_that_stand_in_the_upper_half_are_found_in_pixels_from_the_middle() -> None:
+def test_only_vertical_edges_in_upper_half_are_found() -> None:
     image = np.full((562, WIDTH_PX), 200, np.uint8)
-    cv2.line(image, (300, 40), (300, 200), 20, 5)  # upright
-    cv2.line(image, (100, 100), (260, 110), 20, 5)  # level
+    cv2.line(image, (300, 40), (300, 200), 20, 5)  # vertical
+    cv2.line(image, (100, 100), (260, 110), 20, 5)  # horizontal
     cv2.line(image, (500, 60), (650, 200), 20, 5)  # leans too far
     cv2.line(image, (700, 350), (700, 540), 20, 5)  # in the lower half, where vehicles are
     edges = find_vertical_edges(image)
@@ -83,21 +83,21 @@ def test_edges_that_stand_in_the_upper_half_are_found_in_pixels_from_the_middle(
     assert find_vertical_edges(np.full((90, 160), 128, np.uint8)).shape == (0, 2, 2)
 
 
-def test_a_fisheye_of_unknown_view_takes_its_focal_length_from_upright_lines() -> None:
+def test_fisheye_of_unknown_view_takes_focal_length_from_vertical_edges() -> None:
     view_deg, sigma_rel = FIELD_OF_VIEW_DEG["dashcam"]
     unknown = FocalLength(650.0, sigma_rel, f"that of a dashcam, {view_deg:g} deg across")
-    uprights = LensByVerticalEdges(bend=-0.9, bend_sigma=0.1, fisheye_focal=0.45, edges=500)
-    found = with_uprights(unknown, uprights, WIDTH_PX)
+    vertical = LensByVerticalEdges(bend=-0.9, bend_sigma=0.1, fisheye_focal=0.45, edges=500)
+    found = focal_by_vertical_edges(unknown, vertical, WIDTH_PX)
     assert found.fisheye
     assert found.px == 450.0
     assert found.sigma_rel == WIDE_SIGMA_REL
     assert "fisheye" in found.by
     stated = FocalLength(650.0, 0.03, "as stated, 75 deg across")
-    assert with_uprights(stated, uprights, WIDTH_PX) is stated
-    assert with_uprights(unknown, None, WIDTH_PX) is unknown
+    assert focal_by_vertical_edges(stated, vertical, WIDTH_PX) is stated
+    assert focal_by_vertical_edges(unknown, None, WIDTH_PX) is unknown
 
 
-def test_what_lines_say_of_k1_and_what_is_known_of_cameras_count_by_their_sigmas() -> None:
+def test_k1_of_edges_and_prior_are_weighted_by_sigma() -> None:
     k1, sigma = k1_by_bend((-0.5, 0.1), FOCAL)
     assert k1 == pytest.approx(-0.5 * FOCAL**2, rel=0.05)
     assert sigma == pytest.approx(0.1 * FOCAL**2, rel=0.05)

@@ -61,8 +61,8 @@ def find_vertical_edges(image: NDArray[np.uint8]) -> Floats:
     ends = (ends - 0.5 * (np.array([width_px, height_px]) - 1.0)) / width_px
     ends = np.take_along_axis(ends, np.argsort(ends[..., 1], axis=1)[..., None], axis=1)
     across, down = (ends[:, 1] - ends[:, 0]).T
-    upright = (np.hypot(across, down) > _MIN_LENGTH) & (np.abs(across) < _MAX_SLOPE * down)
-    out: Floats = ends[upright & (ends[..., 1].sum(axis=1) < 0.0)]
+    is_vertical = (np.hypot(across, down) > _MIN_LENGTH) & (np.abs(across) < _MAX_SLOPE * down)
+    out: Floats = ends[is_vertical & (ends[..., 1].sum(axis=1) < 0.0)]
     return out
 
 
