@@ -32,7 +32,7 @@ from birdslam.perception.shipped import run_at_once
 from birdslam.perception.views import make_views
 from birdslam.types import Status
 from birdslam.world.training.augmentation import AugmentationConfig
-from birdslam.world.training.grading import Grades, average_precision, best_score, extents
+from birdslam.world.training.grading import Grades, average_precision, best_score_threshold, extents
 from birdslam.world.training.stream import StreamConfig, examples
 from birdslam.world.training.targets import COLUMN, Example, TargetsConfig, Window, encode
 from birdslam.world.training.validation import validate
@@ -351,7 +351,7 @@ def test_a_false_box_and_a_missed_one_cost_precision() -> None:
     grades.add(Findings(detections=false), frame)
     assert grades.figures()["vehicle_ap50"] == pytest.approx(0.5)
     assert average_precision([0.9, 0.8, 0.7], [False, True, True], 2) == pytest.approx(2.0 / 3.0)
-    assert best_score([0.5, 0.9, 0.1, 0.8], [True, True, False, True], 3) == 0.5
+    assert best_score_threshold([0.5, 0.9, 0.1, 0.8], [True, True, False, True], 3) == 0.5
 
 
 def test_examples_repeat_from_their_seed() -> None:

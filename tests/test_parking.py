@@ -13,12 +13,12 @@ from birdslam.world.street.street import Street
 from birdslam.world.street.street_plan import draw_street
 from birdslam.world.traffic.flow import Mover, populate
 from birdslam.world.traffic.parking import Lot, cleared, draw_lots
-from birdslam.world.traffic.placement import Standing, furnish
+from birdslam.world.traffic.placement import Scenery, furnish
 from birdslam.world.traffic.poses import moving
 
 EGO_S_M, EGO_D_M = 30.0, -1.5
 
-Place = tuple[Street, tuple[Lot, ...], Standing, list[Mover]]
+Place = tuple[Street, tuple[Lot, ...], Scenery, list[Mover]]
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +93,7 @@ def test_nothing_is_built_on_a_lot_and_no_side_road_runs_through_it(places: list
 
 def test_what_is_off_the_lots_stays_and_so_do_posts_at_their_edge() -> None:
     lot = Lot(40.0, 60.0, 8.0, 16.0, (), 0.0)
-    standing = Standing([], [], [], [], [])
+    standing = Scenery([], [], [], [], [])
     for kind, s_m, d_m in (
         (m.BUILDING, 50.0, 12.0), (m.TREE, 50.0, 12.0), (m.POST, 50.0, 8.3), (m.POST, 50.0, 12.0),
         (m.BUILDING, 50.0, -12.0),

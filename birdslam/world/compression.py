@@ -1,7 +1,7 @@
-"""A video encoder as in dashboard cameras (MPEG-4, H.264): blocks moved from the image before, and coarse residuals.
+"""Simulates video compression of dashboard cameras (MPEG-4, H.264): motion-compensated blocks, coarse residuals.
 
-It is our own since OpenCV's writers have no bit rate to set. What it leaves of a road is as theirs: smooth asphalt is
-carried along by its block or stands still, until the next image that is coded alone.
+OpenCV's writers have no bit rate setting. The artefacts on the road are the same: smooth asphalt moves with its block
+or freezes until the next intra-coded image.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from birdslam.geometry.arrays import Floats32, Image
 
 BLOCK_PX, DCT_PX = 16, 8
-GROUP = 12  # images, of which the first is coded alone
-DEADZONE = 1.0 / 6.0  # what is added before a level is rounded down, as H.264's reference encoder does in P images
-STILL_BONUS = 1.0  # grey levels a pixel: a block that stands still costs no bits
+GROUP = 12  # images per group of pictures; the first is intra-coded
+DEADZONE = 1.0 / 6.0  # rounding offset, as in P images of H.264's reference encoder
+STILL_BONUS_GREY = 1.0  # per pixel; a block without motion costs no bits
 
 
 class VideoEncoder:
-    """`code` gives back each image of a video as a player shows it; one after the other, all of one size.
+    """`code` encodes and decodes the images of a video in order, all of one size.
 
     `step` is the quantiser's, in grey levels of the orthonormal DCT (H.264's QP 28 is 16, QP 34 is 32).
     """
@@ -27,7 +27,7 @@ class VideoEncoder:
     def __init__(self, step: float = 24.0) -> None:
         self._step = step
         self._flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
-        self._shown: list[Floats32] = []  # the planes of the image before
+        self._shown: list[Floats32] = []  # planes of the previous decoded image
         self._count = 0
 
     def code(self, image: Image) -> Image:
@@ -46,13 +46,13 @@ class VideoEncoder:
         return np.ascontiguousarray(_image(planes)[:height, :width])
 
     def _moves(self, luma: Floats32) -> Floats32:
-        """(H, W, 2): from where in the image before each pixel's block is taken."""
+        """Source position (H, W, 2) of each pixel's block in the previous image."""
         before, now = self._shown[0].astype(np.uint8), luma.astype(np.uint8)
         flow = self._flow.calc(now, before, None)  # type: ignore[call-overload]
         rows, columns = luma.shape[0] // BLOCK_PX, luma.shape[1] // BLOCK_PX
         blocks = flow.reshape(rows, BLOCK_PX, columns, BLOCK_PX, 2).mean(axis=(1, 3))
         whole = _spread(np.round(4.0 * blocks) / 4.0)  # quarters of a pixel
-        still = _per_block(np.abs(self._shown[0] - luma)) - STILL_BONUS <= _per_block(
+        still = _per_block(np.abs(self._shown[0] - luma)) - STILL_BONUS_GREY <= _per_block(
             np.abs(_moved(self._shown[0], whole) - luma)
         )
         whole[_spread(still)] = 0.0
@@ -66,12 +66,12 @@ def _per_block(plane: Floats32) -> Floats32:
 
 
 def _spread(blocks: NDArray) -> NDArray:
-    """Of each block to each of its pixels."""
+    """Repeats the value of each block for its pixels."""
     return np.repeat(np.repeat(blocks, BLOCK_PX, axis=0), BLOCK_PX, axis=1)
 
 
 def _moved(before: Floats32, moves: Floats32) -> Floats32:
-    """A plane, which may be of half the size of the moves, taken from where the moves say."""
+    """Motion-compensates a plane, which may have half the size of `moves`."""
     size = (before.shape[1], before.shape[0])
     share = size[0] / moves.shape[1]
     scaled = moves if share == 1.0 else cv2.resize(moves, size, interpolation=cv2.INTER_NEAREST) * share
@@ -91,7 +91,7 @@ _DCT = _dct_matrix()
 
 
 def _coarse(residual: Floats32, step: float, rounding: float) -> Floats32:
-    """The residual after its DCT was rounded to multiples of the step."""
+    """The residual with its DCT quantized to multiples of the step."""
     rows, columns = residual.shape[0] // DCT_PX, residual.shape[1] // DCT_PX
     blocks = residual.reshape(rows, DCT_PX, columns, DCT_PX).transpose(0, 2, 1, 3)
     levels = _DCT @ blocks @ _DCT.T / step
@@ -101,7 +101,7 @@ def _coarse(residual: Floats32, step: float, rounding: float) -> Floats32:
 
 
 def _planes(image: Image) -> list[Floats32]:
-    """Brightness, and of a coloured image its two colour differences at half the size."""
+    """Luma, and for a colour image the two chroma planes at half the size."""
     if image.ndim == 2:
         return [image.astype(np.float32)]
     y, cr, cb = cv2.split(cv2.cvtColor(image, cv2.COLOR_BGR2YCrCb))

@@ -1,7 +1,7 @@
-"""The drive that ships with birdslam: half a minute through a town, always the same.
+"""The shipped drive: half a minute through a town, deterministic.
 
-The ego takes a bend, overtakes a slow van, waits at a red light behind a car while a bus beside it hides others, climbs
-a grade through another bend, and rolls down again.
+The ego takes a bend, overtakes a slow van, waits at a red light behind a car next to a bus, climbs a grade through
+another bend, and drives down again.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from birdslam.world.street.course import STEP_M, Course
 from birdslam.world.street.street import Street
 from birdslam.world.street.street_plan import draw_street
 from birdslam.world.traffic.fleet import draw_cyclist, draw_pedestrian, draw_shape, draw_truck
-from birdslam.world.traffic.flow import Mover, populate, settle
+from birdslam.world.traffic.flow import Mover, populate, set_initial_motion
 from birdslam.world.traffic.placement import furnish
 from birdslam.world.traffic.poses import place
 
 RATE_HZ = 33.0
 FRAMES = 1000
-# The field of view of KITTI's cameras, at a size that the shipped networks see
+# The field of view of KITTI's cameras, at the input size of the shipped networks
 CAMERA = Camera(640, 192, 371.2, 371.2, 319.5, 90.0, height_m=1.55, pitch_rad=0.012)
 _SEED = 495
 _STREET_M, _EGO_M = 700.0, 30.0
@@ -36,13 +36,14 @@ _GRADES = ((75.0, 110.0, 0.04), (190.0, 110.0, -0.055))
 
 
 def demo_scenario() -> Scenario:
-    """The world of the shipped drive at its begin."""
+    """The initial state of the shipped drive."""
     rng = np.random.default_rng([_SEED, 5])
     street = draw_street(rng, _STREET_M, _EGO_M, "avenue", demo_course())
     standing = place(street, furnish(rng, street, _EGO_M - 12.0, 560.0))
     right, left = sorted(lane.d_m for lane in street.lanes if lane.direction > 0)[:2]
     light_s = stop_line(street)
-    bystanders = [v for v in settle(populate(rng, street, _EGO_M, right, 480.0), street) if v.lane_d_m is None]
+    everybody = populate(rng, street, _EGO_M, right, 480.0)
+    bystanders = [mover for mover in set_initial_motion(everybody, street) if mover.lane_d_m is None]
     red = ((light_s, _RED_UNTIL_S),)
 
     def car(shape: str, s: float, d: float, speed: float, wish: float, **more: object) -> Mover:
@@ -100,7 +101,7 @@ def demo_course() -> Course:
 
 
 def stop_line(street: Street) -> float:
-    """Where one waits for the first crossing after the van."""
+    """The stop line of the first crossing after the van."""
     s = [float(row[0] - row[1]) - 3.5 for row in street.crossings]
     return next(at for at in s if at > _EGO_M + 150.0)
 

@@ -1,4 +1,4 @@
-"""From a rendered scene to its truth: objects, lanes, roads, in ego and in the image."""
+"""Ground truth of a rendered scene: objects, lanes and roads, in ego and in the image."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def frame_of(
     image: NDArray[np.uint8], rendered: Rendered, scene: Bodies, movers: list[Mover], street: Street, camera: Camera,
     T_world_ego: Floats, s_m: float, frame_id: int, t_source_ns: int,
 ) -> WorldFrame:  # fmt: skip
-    """Everything that is true of a rendered frame."""
+    """The ground truth of a rendered frame."""
     R_ego_cam = camera.ground.R_ego_cam
     T_ego_cam = np.eye(4)
     T_ego_cam[:3, :3], T_ego_cam[:3, 3] = R_ego_cam, (0.0, 0.0, camera.height_m)
@@ -63,7 +63,7 @@ def frame_of(
 
 
 def _velocity(mover: Mover, yaw_rad: float) -> Floats:
-    """Over the ground, in world."""
+    """Velocity over the ground, in world."""
     street_rad = yaw_rad - mover.turn_rad
     along, across = mover.velocity
     c, s = math.cos(street_rad), math.sin(street_rad)
@@ -82,7 +82,7 @@ def _to_ego(street: Street, T_world_ego: Floats, s: Floats, d: Floats) -> Floats
 
 
 def lanes_of(street: Street, T_world_ego: Floats, s_m: float) -> tuple[WorldLane, ...]:
-    """Every line and edge along the street, cut where a crossing cuts it."""
+    """All lines and edges along the street, interrupted at crossings."""
     s = np.arange(max(s_m - LANE_BEHIND_M, 0.0), min(s_m + LANE_AHEAD_M, street.length_m), LANE_STEP_M)
     lanes = []
     for line in street.lines:
@@ -102,7 +102,7 @@ def lanes_of(street: Street, T_world_ego: Floats, s_m: float) -> tuple[WorldLane
 
 
 def roads_of(street: Street, T_world_ego: Floats, s_m: float) -> tuple[Floats, ...]:
-    """The main road as one polygon, each side road as another."""
+    """Polygons of the main road and of each side road."""
     s = np.arange(max(s_m - LANE_BEHIND_M, 0.0), min(s_m + LANE_AHEAD_M, street.length_m), LANE_STEP_M)
     left = _to_ego(street, T_world_ego, s, np.full(len(s), street.left_m))
     right = _to_ego(street, T_world_ego, s, np.full(len(s), street.right_m))

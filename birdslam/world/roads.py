@@ -1,7 +1,4 @@
-"""Roads that odometry and lanes must master, each from its seed: motorways, ramps, nights, a town, an avenue, hills.
-
-Each is a scenario of its own: what lies beside a motorway is far, its asphalt smooth; a ramp begins in its bend.
-"""
+"""Difficult roads for odometry and lanes, each from a seed: motorways, ramps, nights, a town, an avenue, hills."""
 
 from __future__ import annotations
 
@@ -21,27 +18,27 @@ from birdslam.world.street.course import STEP_M, Course
 from birdslam.world.street.street import ASPHALT, BAND, CROSSING, GRASS, HATCHED, LINE, LINE_KINDS, MARK, Lane, Street
 from birdslam.world.street.street_plan import draw_street
 from birdslam.world.traffic.fleet import draw_shape, draw_truck
-from birdslam.world.traffic.flow import Mover, populate, settle
-from birdslam.world.traffic.placement import Standing, background, furnish, tree
+from birdslam.world.traffic.flow import Mover, populate, set_initial_motion
+from birdslam.world.traffic.placement import Scenery, background, furnish, tree
 from birdslam.world.traffic.poses import place
 
-# The field of view of KITTI's cameras, at a size that renders in a sixth of a second
+# The field of view of KITTI's cameras, at a size that renders fast
 CAMERA = Camera(640, 192, 371.2, 371.2, 319.5, 90.0, height_m=1.65, pitch_rad=0.008)
 
 AXLE_M = 1.7  # from the rear axle to the camera
 LANE_M, SHOULDER_M, MEDIAN_M = 3.6, 2.5, 3.0
 GERMAN, AMERICAN = (18.0, 6.0), (12.2, 3.05)  # a dashed line's period and dash
-RAIL_M, RAIL_HIGH_M = 4.0, 0.75  # a guard rail's piece
-POST_EVERY_M = 50.0  # posts beside a road
-EGO_M = 30.0  # where the ego begins
-QUEUE_M, LIGHT_M = 14.0, 45.0  # from there: the vehicle ahead in a queue, and the light that it brakes for
-NIGHT_GREY = 1.0  # cd/m^2: of the road ten metres ahead in its own beams such a camera makes a light grey
-_BEYOND_M = 280.0  # of road behind the last place of a drive
-_ACROSS = 0.75  # of a bend's radius: no further aside is there ground
+RAIL_M, RAIL_HIGH_M = 4.0, 0.75  # length and height of a piece of guard rail
+POST_EVERY_M = 50.0  # spacing of posts beside a road
+EGO_M = 30.0  # initial position of the ego
+QUEUE_M, LIGHT_M = 14.0, 45.0  # from the ego: the vehicle ahead in a queue, and its red light
+NIGHT_GREY = 1.0  # cd/m^2; luminance that becomes middle grey
+_BEYOND_M = 280.0  # length of road beyond the end of a drive
+MAX_OFFSET_RATIO = 0.75  # of a bend's radius: lateral extent of the ground
 
 
 def camera_of(width_px: int) -> Camera:
-    """The same field of view in images of another width."""
+    """A camera with the same field of view and another image width."""
     k = width_px / CAMERA.width_px
     middle_u, middle_v = (k * (c + 0.5) - 0.5 for c in (CAMERA.cx_px, CAMERA.cy_px))
     size = width_px, round(k * CAMERA.height_px)
@@ -51,7 +48,7 @@ def camera_of(width_px: int) -> Camera:
 
 @dataclass(frozen=True)
 class Road:
-    """A drive of `frames` images along a road; `hard` says what is hard on it."""
+    """A drive of `frames` images along a road; `hard` describes its difficulty."""
 
     hard: str
     scenario: Callable[[], Scenario]
@@ -61,7 +58,7 @@ class Road:
 
 @dataclass(frozen=True)
 class _Surface:
-    """How the road's asphalt and paint look."""
+    """Appearance of asphalt and paint."""
 
     tone: float = 1.0
     dashes: tuple[float, float] = GERMAN
@@ -71,7 +68,7 @@ class _Surface:
 def motorway(
     seed: int, speed_mps: float, bend_per_m: float, surface: _Surface, traffic: bool = True, night: Night | None = None
 ) -> Scenario:
-    """Three lanes each way; the ego in the right one or, where there is traffic, the middle one."""
+    """Three lanes per direction; the ego is in the right one or, with traffic, in the middle one."""
     rng = np.random.default_rng([seed, 6])
     length_m = EGO_M + 14.0 * speed_mps + _BEYOND_M
     s = np.arange(int(length_m / STEP_M) + 1) * STEP_M
@@ -89,12 +86,12 @@ def motorway(
 
 
 def ramp(seed: int, radius_m: float, speed_mps: float, arc_m: float, left: bool, glare: bool = False) -> Scenario:
-    """One lane that bends from before the first image on, straight after `arc_m`; in glare with chevrons beside it."""
+    """One lane that bends from the start and is straight after `arc_m`; with `glare` overexposed, with chevrons."""
     rng = np.random.default_rng([seed, 7])
     length_m = EGO_M + 14.0 * speed_mps + _BEYOND_M
     s = np.arange(int(length_m / STEP_M) + 1) * STEP_M
     straight = np.clip((s - EGO_M - arc_m) / 25.0, 0.0, 1.0)
-    before = np.clip((s - EGO_M + 12.0) / 4.0, 0.0, 1.0)  # what lies behind must not come round again
+    before = np.clip((s - EGO_M + 12.0) / 4.0, 0.0, 1.0)  # straight behind the ego, so that the circle does not close
     course = Course((1.0 if left else -1.0) / radius_m * (1.0 - straight) * before, np.zeros_like(s))
     street = _road(course, 1, 0, _Surface(tone=1.7 if glare else 1.0))
     if glare:
@@ -107,7 +104,7 @@ def ramp(seed: int, radius_m: float, speed_mps: float, arc_m: float, left: bool,
 
 
 def night_street(seed: int, speed_mps: float) -> Scenario:
-    """A country road with bends: a car ahead, others coming, posts and trees in the beams."""
+    """A country road with bends: a car ahead, oncoming cars, posts and trees in the beams."""
     rng = np.random.default_rng([seed, 8])
     length_m = EGO_M + 14.0 * speed_mps + _BEYOND_M
     s = np.arange(int(length_m / STEP_M) + 1) * STEP_M
@@ -127,7 +124,7 @@ def night_street(seed: int, speed_mps: float) -> Scenario:
 
 
 def built_up(seed: int, kind: str, speed_mps: float, grade: float = 0.0) -> Scenario:
-    """A drawn street of a kind by day with all that stands and drives there, gently bent, up and down at `grade`."""
+    """A random street of a kind by day with scenery and traffic, gently bent, up and down at `grade`."""
     rng = np.random.default_rng([seed, 9])
     length_m = EGO_M + 14.0 * speed_mps + _BEYOND_M
     s = np.arange(int(length_m / STEP_M) + 1) * STEP_M
@@ -135,13 +132,13 @@ def built_up(seed: int, kind: str, speed_mps: float, grade: float = 0.0) -> Scen
     street = draw_street(rng, length_m, EGO_M, kind, course)
     standing = place(street, furnish(rng, street, EGO_M - 12.0, length_m - 50.0))
     lane = next(lane for lane in street.lanes if lane.direction > 0)
-    movers = tuple(settle(populate(rng, street, EGO_M, lane.d_m, 300.0), street))
+    movers = tuple(set_initial_motion(populate(rng, street, EGO_M, lane.d_m, 300.0), street))
     ego = Mover(draw_shape(rng, "estate"), EGO_M, lane.d_m, 0.0, speed_mps, speed_mps, lane.d_m)
     return Scenario(street, standing, movers, ego, _sunny(), _camera(), seed, AXLE_M)
 
 
 def queue(seed: int, kind: str, speed_mps: float, ahead: str, red_s: float = 6.0) -> Scenario:
-    """A drawn street; a vehicle close ahead of the ego brakes with it for a red light, others drive beside them.
+    """A random street; a vehicle close ahead brakes for a red light, others drive beside the ego.
 
     `ahead` is the vehicle's shape, or "truck"; the light is red until `red_s`.
     """
@@ -155,11 +152,11 @@ def queue(seed: int, kind: str, speed_mps: float, ahead: str, red_s: float = 6.0
 
 
 def _road(course: Course, forth: int, back: int, surface: _Surface) -> Street:
-    """Lanes forth and back, a median between more than one of each, shoulders, rails' and grass beside."""
+    """Lanes forth and back, a median if both directions have several, shoulders, guard rails and grass."""
     apart = 0.5 * MEDIAN_M if min(forth, back) > 1 else 0.0
     right, left = -apart - forth * LANE_M, apart + back * LANE_M
     shoulder = SHOULDER_M if max(forth, back) > 1 or back == 0 else 0.5
-    far = min(_ACROSS / max(float(np.abs(course.curvature).max()), 1e-4), 75.0)
+    far = min(MAX_OFFSET_RATIO / max(float(np.abs(course.curvature).max()), 1e-4), 75.0)
     edges = right - shoulder, left + shoulder
     bands = [(-far, edges[0], 0.0, 0.0, GRASS, 1.0), (edges[1], far, 0.0, 0.0, GRASS, 1.0)]
     if apart > 0.0:
@@ -192,11 +189,11 @@ def _road(course: Course, forth: int, back: int, surface: _Surface) -> Street:
 
 
 def _verge(rng: np.random.Generator, street: Street, length_m: float):  # type: ignore[no-untyped-def]
-    """Guard rails outside and along the median, white posts, bushes, woods further off."""
-    out = Standing([], [], [], [], [])
+    """Guard rails outside and along the median, white posts, bushes, and woods farther away."""
+    out = Scenery([], [], [], [], [])
     wide = max(abs(lane.d_m) for lane in street.lanes) > LANE_M
     rails = [street.right_m - 0.6, street.left_m + 0.6, *((-0.5, 0.5) if wide else ())]
-    inside = 1.0 if street.curvature(EGO_M + 20.0) > 0.0 else -1.0  # towards where a bend has its centre
+    inside = 1.0 if street.curvature(EGO_M + 20.0) > 0.0 else -1.0  # towards the centre of a bend
     for d in rails if wide else [rail for rail in rails if rail * inside < 0.0]:
         for s in np.arange(0.0, length_m, RAIL_M):
             P = out.add(m.WALLING, float(s) + 0.5 * RAIL_M, d, 0.0, (RAIL_M, 0.1, RAIL_HIGH_M))
@@ -210,16 +207,16 @@ def _verge(rng: np.random.Generator, street: Street, length_m: float):  # type: 
             if rng.random() < 0.6 and street.curvature(float(s)) * d < 0.6:
                 tree(rng, out, float(s), d, float(rng.uniform(0.8, 2.5)), 1, 1)
         background(rng, street, out, sign, front, 0.0, length_m)
-        for s in np.arange(0.0, length_m, 6.0):  # a sharp bend, about which it leaves all bare
+        for s in np.arange(0.0, length_m, 6.0):  # sharp bends have no scenery inside
             bend = abs(street.curvature(float(s)))
             d = front + sign * float(rng.uniform(4.0, 30.0))
-            if bend > 0.01 and abs(d) * bend < _ACROSS - 0.05:
+            if bend > 0.01 and abs(d) * bend < MAX_OFFSET_RATIO - 0.05:
                 tree(rng, out, float(s), d, float(rng.uniform(3.0, 12.0)), int(rng.choice([0, 2])), 3)
     return place(street, out)
 
 
 def _traffic(rng: np.random.Generator, street: Street, own_d_m: float, speed_mps: float) -> tuple[Mover, ...]:
-    """Cars and trucks on the other lanes, nobody close ahead in the ego's own."""
+    """Cars and trucks on the other lanes; the ego lane is free ahead."""
     movers = []
     for lane in street.lanes:
         mean = speed_mps * (0.85 if lane.d_m < own_d_m else 1.12) if lane.direction > 0 else speed_mps
@@ -247,12 +244,12 @@ def _sunny() -> Floats:
 
 
 def _camera(exposure: float = 1.0) -> Lens:
-    """A camera of the day; from an exposure of two on its road is nearly white."""
+    """A camera by day; with an exposure of two or more the road is nearly white."""
     return Lens(exposure, 1.0 / 2.2, 1.05, (1.0, 1.0, 1.0), 0.4, 0.002, 0.004, 0.1, 0.0, 0.8, 0, 0.0)
 
 
 def dark_camera() -> Lens:
-    """The same with all the gain that it has: noise, a glow about lamps."""
+    """The same camera at maximum gain: noise, a glow around lamps."""
     return Lens(
         1.0, 1.0 / 2.2, 1.05, (1.0, 1.0, 1.0), 0.6, 0.0015, 0.015, 0.2, 0.1, 0.6, 0, 0.0, fixed=NIGHT_GREY
     )  # fmt: skip

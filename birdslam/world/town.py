@@ -1,7 +1,7 @@
-"""A block of a town, 2 km around, to drive again and again: in other light, another lane, the other way, rain, night.
+"""A 2 km loop in a town for repeated drives: other light, another lane, the opposite direction, rain, night.
 
-The second half of its way is the first turned by half a turn, so that the end is the beginning, and all that is painted
-repeats with each round: the asphalt's grain too, whose tiles divide two kilometres.
+The second half of the loop is the first rotated by half a turn, so the loop closes. Texture and paint repeat in each
+round: the asphalt's tiles divide two kilometres.
 """
 
 from __future__ import annotations
@@ -24,33 +24,33 @@ from birdslam.world.street.course import STEP_M, Course
 from birdslam.world.street.street import Street
 from birdslam.world.street.street_plan import draw_street
 from birdslam.world.traffic.fleet import draw_shape
-from birdslam.world.traffic.flow import Mover, populate, settle
-from birdslam.world.traffic.placement import Standing, furnish
+from birdslam.world.traffic.flow import Mover, populate, set_initial_motion
+from birdslam.world.traffic.placement import Scenery, furnish
 from birdslam.world.traffic.poses import moving, place
 from birdslam.world.truth import WorldFrame
 from birdslam.world.windscreen import Overlay
 
 ROUND_M, ROUNDS = 2000.0, 2
-BEYOND_M = 300.0  # of road in sight at the end
+BEYOND_M = 300.0  # length of road beyond the end
 RATE_HZ, SPEED_MPS = 10.0, 10.0
-BEGIN_M = 30.0
-CORNERS_M, CORNER_M = (210.0, 690.0), 110.0  # where the two corners of half a round begin, and how long they are
+START_M = 30.0
+CORNERS_M, CORNER_M = (210.0, 690.0), 110.0  # starts and length of the two corners in half a round
 GRADE, GRADE_M = 0.02, 500.0
-SAMPLES = 2  # of a pixel, across and down
+SAMPLES = 2  # per pixel, horizontally and vertically
 _SEED = 17  # an urban street of two lanes forth and one back, cars parked on both sides
 
 
 @dataclass(frozen=True)
 class TownDrive:
-    """A drive in the town; `differs` says what is other than when its map was made."""
+    """A drive in the town; `differs` describes the difference to the mapping drive."""
 
     differs: str
     frames: int
-    begin_m: float = BEGIN_M
-    lane: int = 0  # of those in the ego's direction, from the middle of the road
+    begin_m: float = START_M
+    lane: int = 0  # in the ego's direction, counted from the middle of the road
     seed: int = 1  # of moving and parked cars
     light: str = "afternoon"  # evening, rain, night
-    back: bool = False  # the other way around
+    back: bool = False  # opposite direction
 
 
 DRIVES: dict[str, TownDrive] = {
@@ -66,7 +66,7 @@ DRIVES: dict[str, TownDrive] = {
 
 
 def frames(name: str, count: int | None = None) -> Iterator[WorldFrame]:
-    """The first `count` images of a drive (None: all) with their truth, seen by roads.CAMERA at RATE_HZ."""
+    """The first `count` frames of a drive (None: all) with their truth, from roads.CAMERA at RATE_HZ."""
     planned = DRIVES[name]
     rain = Overlay("rain", CAMERA.width_px, CAMERA.height_px, planned.seed) if planned.light == "rain" else None
     for frame in drive(scenario(planned), CAMERA, count or planned.frames, RATE_HZ, SAMPLES):
@@ -74,17 +74,17 @@ def frames(name: str, count: int | None = None) -> Iterator[WorldFrame]:
 
 
 def scenario(planned: TownDrive) -> Scenario:
-    """The town at the begin of a drive."""
+    """The initial state of a drive in the town."""
     rng = np.random.default_rng([_SEED, 39])
     course = _course()
-    around = draw_street(rng, ROUND_M, BEGIN_M, "urban", course)
-    street = _again_and_again(around, course)
+    around = draw_street(rng, ROUND_M, START_M, "urban", course)
+    street = _repeat_rounds(around, course)
     standing = furnish(rng, replace(street, crossings=around.crossings), 0.0, ROUND_M)
     built = place(street, standing)
     built = built.subset(_clear_of_the_road(street, standing, built))
 
     rng = np.random.default_rng([planned.seed, 40])
-    everybody = settle(populate(rng, around, 0.0, 0.0, ROUND_M), around)
+    everybody = set_initial_motion(populate(rng, around, 0.0, 0.0, ROUND_M), around)
     parked = moving(street, [each for each in everybody if each.lane_d_m is None])
     parked = replace(parked, object_id=np.full(len(parked.kind), -1, np.int32))
     road = _reversed(street) if planned.back else street
@@ -99,7 +99,7 @@ def scenario(planned: TownDrive) -> Scenario:
 
 
 def _course() -> Course:
-    """Of one round."""
+    """The course of one round."""
     s = np.arange(round(0.5 * ROUND_M / STEP_M)) * STEP_M
     curvature = np.zeros_like(s)
     for begin in CORNERS_M:
@@ -107,31 +107,31 @@ def _course() -> Course:
         curvature[inside] += 1.0 - np.cos(2.0 * math.pi * (s[inside] - begin) / CORNER_M)
     curvature *= math.pi / (STEP_M * curvature.sum())
     slope = GRADE * np.sin(2.0 * math.pi * s / GRADE_M)
-    # One more step, as tables of streets have it
+    # Tables of streets have one more entry than steps
     return Course(*(np.append(np.tile(column, 2), column[0]) for column in (curvature, slope)))
 
 
-def _again_and_again(street: Street, course: Course) -> Street:
-    """A street of one round as a table of ROUNDS of them, and what is in sight at their end."""
+def _repeat_rounds(street: Street, course: Course) -> Street:
+    """Repeats a street of one round ROUNDS times, with BEYOND_M more at the end."""
     count = round((ROUNDS * ROUND_M + BEYOND_M) / STEP_M) + 1
     along = Course(*(np.resize(column[:-1], count) for column in course.columns))
     kept = street.marks[(street.marks[:, 1] > 0.0) & (street.marks[:, 2] < ROUND_M)]
     crossings, marks = (
-        np.concatenate([_further(rows, columns, turn * ROUND_M) for turn in range(ROUNDS + 1)])
+        np.concatenate([_shift_columns(rows, columns, turn * ROUND_M) for turn in range(ROUNDS + 1)])
         for rows, columns in ((street.crossings, [0]), (kept, [1, 2]))
     )
     return replace(street.along(along), crossings=crossings, marks=marks)
 
 
-def _further(rows: Floats32, columns: list[int], way_m: float) -> Floats32:
-    """These rows where the columns that hold an s are so much greater."""
+def _shift_columns(rows: Floats32, columns: list[int], way_m: float) -> Floats32:
+    """Adds an offset to the columns that hold an s."""
     out = rows.copy()
     out[:, columns] += np.float32(way_m)
     return out
 
 
-def _clear_of_the_road(street: Street, standing: Standing, built: Bodies) -> Bools:
-    """(N,) what stands beside its own part of the road and on no other, nor twice where the round ends."""
+def _clear_of_the_road(street: Street, standing: Scenery, built: Bodies) -> Bools:
+    """Mask (N,) of the scenery that is not on another part of the road, nor duplicated at the end of the round."""
     one_round = round(ROUND_M / STEP_M)
     line = np.column_stack([street.x_m, street.y_m])[:one_round]
     nearest_m, _ = cKDTree(line).query(built.position_m[:, :2])
@@ -143,7 +143,7 @@ def _clear_of_the_road(street: Street, standing: Standing, built: Bodies) -> Boo
 
 
 def _reversed(street: Street) -> Street:
-    """The same road for a vehicle that drives against its s."""
+    """The street for driving in the opposite direction."""
     length_m = street.length_m
     bands = street.bands[:, [1, 0, 3, 2, 4, 5]] * np.array([-1, -1, 1, 1, 1, 1], np.float32)
     lines = street.lines * np.array([-1, *[1] * 8], np.float32)
@@ -165,7 +165,7 @@ def _reversed(street: Street) -> Street:
 
 
 def _traffic(rng: np.random.Generator, street: Street, begin_m: float, own_d_m: float) -> Iterator[Mover]:
-    """A car ahead, some in the other lane, and those who come."""
+    """A car ahead, cars in the other lane, and oncoming cars."""
     shapes = "hatchback", "suv", "van", "sedan", "estate", "city"
     for lane in street.lanes:
         at = begin_m + (35.0 if lane.d_m == own_d_m else float(rng.uniform(15.0, 60.0)))
@@ -180,7 +180,7 @@ def _traffic(rng: np.random.Generator, street: Street, begin_m: float, own_d_m: 
 
 
 def sky_of(light: str) -> Floats:
-    """Of day, evening, rain or night."""
+    """The sky of day, evening, rain or night."""
     if light == "night":
         return even_sky(0.25)
     sky = demo_sky()

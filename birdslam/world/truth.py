@@ -1,7 +1,7 @@
-"""What the built-in world knows about each of its frames: exact truth, in metres and pixels.
+"""Exact ground truth of the frames of the built-in world, in metres and pixels.
 
 Frames are those of `birdslam.types`: ego is the camera's foot on the road, REP-103; camera is x right, y down, z
-forward. The road under the ego is the plane of `WorldFrame.camera.ground`; far away a real road may leave it.
+forward. The road at the ego is the plane of `WorldFrame.camera.ground`; farther away the road may differ.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from birdslam.geometry.arrays import Floats, Floats32
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 
-# Of each pixel. `lane` is painted lane and road boundaries; other paint (zebras, arrows, stop lines) is `road`;
-# `pavement` is what is paved beside the road, kerbs too; grass is `vegetation`; cyclists with their cycles are `person`
+# Classes of pixels. `lane` is painted lane and road boundaries; other paint (zebras, arrows, stop lines) is `road`;
+# `pavement` includes kerbs; grass is `vegetation`; cyclists with their cycles are `person`
 CLASSES = ("sky", "road", "lane", "pavement", "building", "vegetation", "pole_sign", "vehicle", "person", "other")
 LABELS = ("car", "van", "truck", "bus", "cyclist", "pedestrian")
 
 
 @dataclass(frozen=True)
 class WorldObject:
-    """A body that can move, in sight or hidden behind others; `T_ego_object` is the centre of its footprint."""
+    """A movable body, visible or hidden; `T_ego_object` is the centre of its footprint."""
 
     object_id: int
     label: str  # of LABELS
@@ -35,15 +35,15 @@ class WorldObject:
     yaw_cam_rad: float  # about camera's down axis; the yaw of `T_ego_object`
     box_px: Floats  # (4,) x1 y1 x2 y2 of the whole body, hidden parts too, clipped to the image
     full_box_px: Floats  # (4,) the same unclipped
-    visible: float  # fraction of its projection inside the image that nothing hides
+    visible: float  # unoccluded fraction of its projection inside the image
     truncated: float  # fraction of the full box's area outside the image
-    pixels: int  # of `WorldFrame.instances` that are its own
+    pixels: int  # its pixels in `WorldFrame.instances`
     velocity_mps: Floats  # (2,) over the ground, in world
 
 
 @dataclass(frozen=True)
 class WorldLane:
-    """A lane or road boundary in ego, also where something hides it or it is dashed."""
+    """A lane or road boundary in ego, including hidden parts and gaps of dashes."""
 
     lane_id: int
     kind: str  # solid, dashed, dotted, double, double_dashed, kerb (an edge without paint)
@@ -52,7 +52,7 @@ class WorldLane:
 
 @dataclass(frozen=True)
 class WorldFrame:
-    """One rendered image and all that is true of it."""
+    """One rendered image and its ground truth."""
 
     image: NDArray[np.uint8]  # (H, W, 3) BGR
     depth_m: Floats32  # (H, W) along the optical axis, inf is sky
@@ -60,8 +60,8 @@ class WorldFrame:
     instances: NDArray[np.uint16]  # (H, W) object_id + 1, 0 is none
     objects: tuple[WorldObject, ...]
     lanes: tuple[WorldLane, ...]
-    road_m: tuple[Floats, ...]  # polygons (N, 2) in ego: the road that can be driven on, also where hidden
-    camera: Camera  # with this frame's own height, pitch and roll over the road
+    road_m: tuple[Floats, ...]  # polygons (N, 2) in ego: the drivable road, including hidden parts
+    camera: Camera  # with this frame's height, pitch and roll over the road
     T_world_cam: Floats  # (4, 4) camera axes in world
     frame_id: int
     t_source_ns: int

@@ -1,6 +1,6 @@
-"""What stands still between the road and the camera: drops, dirt, a reflection on the glass, the car's own bonnet.
+"""Draws fixed obstructions over images: drops, dirt, a reflection on the windscreen, the ego's bonnet.
 
-Drawn over images that are rendered or recorded, seeded, with OpenCV and numpy alone.
+For rendered or recorded images, seeded, with OpenCV and numpy only.
 """
 
 from __future__ import annotations
@@ -12,23 +12,23 @@ import numpy as np
 
 from birdslam.geometry.arrays import Image
 
-Edit = Callable[[int, int, Image], Image]  # an image's index, how many there are, the image -> what is seen of it
+Edit = Callable[[int, int, Image], Image]  # index of an image, number of images, image -> edited image
 
 KINDS = ("nothing", "drops", "rain", "drops_defocused", "dirt", "reflection")
-# Drops in front of the focus: their number, radius and blur over the image's width, the share of a pixel's light that
-# comes through them, how far what is behind is drawn to their middle, and the light that they add (sky) or take
+# Defocused drops: number, radius and blur in image widths, opacity, refraction towards their centre, and light that
+# they add (sky) or absorb
 _DEFOCUSED_DROPS, _DEFOCUSED_RADIUS_REL, _DEFOCUS_REL = 45, (0.012, 0.04), 0.006
 _DEFOCUSED_COVER, _BEND, _DEFOCUSED_LIGHT_GREY = (0.4, 0.95), (-0.5, 0.5), (-25.0, 35.0)
-BONNET_SHARE = 0.14  # of the image's height, in its middle
-LACQUER_GREY, MIRRORED = 40.0, 0.35  # of a bonnet: its own brightness, and the share of what is over it
+BONNET_SHARE = 0.14  # of the image height, at the centre column
+BONNET_GREY, REFLECTED_RATIO = 40.0, 0.35  # brightness of a bonnet, and its reflectance
 
 
 class Overlay:
-    """`draw` puts one of KINDS over an image, the same each time.
+    """`draw` draws one of KINDS over an image, always at the same position.
 
-    Dirt is opaque, a drop (of rain: small, and many) shows the image upside down and blurred within a bright rim, a
-    reflection is added to what lies behind it. A drop in front of the focus is a wide, faint disc without a rim that
-    blurs what is behind it, bends it towards its middle or away from it, and takes or adds some light.
+    Dirt is opaque. A drop shows the image upside down and blurred within a bright rim; rain has many small drops. A
+    reflection is added to the image. A defocused drop is a wide, faint disc without a rim that blurs and refracts the
+    image, and absorbs or adds light.
     """
 
     def __init__(self, kind: str, width_px: int, height_px: int, seed: int) -> None:
@@ -38,14 +38,14 @@ class Overlay:
             return
         rng = np.random.default_rng(seed)
         count = {"drops": 60, "rain": 1200, "dirt": 45, "reflection": 40}.get(kind, 0)
-        cover = np.zeros((height_px, width_px), np.float32)  # share of the overlay in each pixel
-        brightness = np.zeros((height_px, width_px), np.float32)  # its own brightness
+        cover = np.zeros((height_px, width_px), np.float32)  # opacity of each pixel
+        brightness = np.zeros((height_px, width_px), np.float32)  # of the overlay
         for _ in range(count):
             centre = (int(rng.integers(0, width_px)), int(rng.integers(0, height_px)))
             largest = 8 if kind == "rain" else 26
             radius = max(1, int(rng.integers(largest // 5, largest) * width_px / 1242))
             light = float(rng.uniform(15.0, 70.0))
-            if kind == "reflection":  # of what lies on the dashboard: edges over the lower half
+            if kind == "reflection":  # objects on the dashboard: edges in the lower half
                 centre = (centre[0], height_px // 2 + centre[1] // 2)
                 end = (centre[0] + int(rng.integers(-150, 150)), centre[1] + int(rng.integers(-20, 20)))
                 cv2.line(brightness, centre, end, light, int(rng.integers(1, 4)), cv2.LINE_AA)
@@ -74,12 +74,12 @@ class Overlay:
 
 
 class _Lens:
-    """Drops in front of the focus: `draw` shows the image through them."""
+    """Defocused drops: `draw` shows the image through them."""
 
     def __init__(self, width_px: int, height_px: int, seed: int) -> None:
         rng = np.random.default_rng(seed)
         v, u = np.mgrid[:height_px, :width_px].astype(np.float32)
-        self._u, self._v = u.copy(), v.copy()  # where a pixel's light comes from
+        self._u, self._v = u.copy(), v.copy()  # source position of each pixel
         self._cover = np.zeros((height_px, width_px), np.float32)
         self._light = np.zeros((height_px, width_px), np.float32)
         self._blur_px = _DEFOCUS_REL * width_px
@@ -103,7 +103,7 @@ class _Lens:
 
 
 def from_share(kind: str, seed: int, share: float) -> Edit:
-    """One of KINDS over the images after a share of them: 0 from the first one on."""
+    """One of KINDS over the images from a fraction of the sequence on; 0: from the first one."""
     overlays: dict[tuple[int, ...], Overlay] = {}
 
     def edit(index: int, count: int, image: Image) -> Image:
@@ -120,13 +120,13 @@ def from_middle(kind: str, seed: int) -> Edit:
 
 
 def bonnet(image: Image) -> Image:
-    """A car's own bonnet along the lower edge: lacquer of one brightness that mirrors, blurred, what is over it."""
+    """The ego's bonnet along the lower edge, which reflects the image above it, blurred."""
     height, width = image.shape[:2]
     mask = np.zeros((height, width), np.float32)
     high = BONNET_SHARE * height
     centre, axes = (width // 2, height + round(high)), (round(0.62 * width), round(2.0 * high))
     cv2.ellipse(mask, centre, axes, 0.0, 0.0, 360.0, 1.0, -1, cv2.LINE_AA)
     upside_down = cv2.GaussianBlur(image[::-1], (0, 0), sigmaX=4.0, sigmaY=10.0).astype(np.float32)
-    shown = LACQUER_GREY + MIRRORED * np.roll(upside_down, round(0.5 * height), axis=0)
+    shown = BONNET_GREY + REFLECTED_RATIO * np.roll(upside_down, round(0.5 * height), axis=0)
     cover = mask if image.ndim == 2 else mask[..., None]
     return np.clip((1.0 - cover) * image + cover * shown, 0.0, 255.0).astype(np.uint8)

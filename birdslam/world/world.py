@@ -1,6 +1,6 @@
 """The built-in world: a street with traffic, seen by a car's camera, with exact truth. Needs numba (extra `train`).
 
-`sample` gives one frame of a world of its own; `World` a drive. The same seed gives the same bytes on one machine.
+`sample` gives one frame of an independent world, `World` a drive. Deterministic by seed on one machine.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from birdslam.world.truth import WorldFrame
 
 
 class WorldConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What is drawn for a camera, and how far truth reaches."""
+    """Distribution of cameras, and range of the truth."""
 
     width_px: int = 640
     height_px: int = 192
@@ -33,14 +33,14 @@ class WorldConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pitch_rad: float = math.radians(4.0)  # at most, up and down
     roll_rad: float = math.radians(2.0)
     field_of_view_rad: tuple[float, float] = (math.radians(40.0), math.radians(100.0))
-    samples: int = 2  # of a pixel, across and down
-    street: str = ""  # residential, urban, avenue, country, motorway, industrial, alley; "": drawn
+    samples: int = 2  # per pixel, horizontally and vertically
+    street: str = ""  # residential, urban, avenue, country, motorway, industrial, alley; "": random
     street_m: float = 240.0  # its length in a sample
-    ego_m: float = 30.0  # how far along it the ego is, or starts
+    ego_m: float = 30.0  # initial position of the ego along it
 
 
 def sample(seed: int, width_px: int, height_px: int) -> WorldFrame:
-    """One frame of a street, weather and camera drawn from `seed`, as networks are trained on."""
+    """One frame of a random street, weather and camera, as used for training."""
     rng = np.random.default_rng([seed, 1])
     config = WorldConfig(width_px=width_px, height_px=height_px)
     street = draw_street(rng, config.street_m, config.ego_m, config.street or None)
@@ -66,13 +66,13 @@ def sample(seed: int, width_px: int, height_px: int) -> WorldFrame:
 
 
 def draw_camera(rng: np.random.Generator, config: WorldConfig) -> Camera:
-    """A camera as cars have it; its image may be a crop of a taller one, so its centre may lie off the middle."""
+    """A random car camera; its image may be a crop, so the principal point may be off-centre."""
     u = rng.random(3)
     low, high = config.field_of_view_rad
     fx = 0.5 * config.width_px / math.tan(0.5 * (low + (high - low) * float(rng.beta(1.6, 1.8))))
     fy = fx * float(np.clip(rng.normal(1.0, 0.015), 0.96, 1.04))
     pitch = float(np.clip(rng.normal(0.0, 0.4), -1.0, 1.0)) * config.pitch_rad
-    horizon = float(np.clip(rng.normal(0.43, 0.1), 0.12, 0.66))  # of the image's height, cropped as one crops
+    horizon = float(np.clip(rng.normal(0.43, 0.1), 0.12, 0.66))  # in image heights, after the crop
     return Camera(
         config.width_px,
         config.height_px,
@@ -89,7 +89,7 @@ def draw_camera(rng: np.random.Generator, config: WorldConfig) -> Camera:
 
 
 class World:
-    """A street with traffic from a seed, and a camera drawn from what cars have unless given."""
+    """A street with traffic from a seed, and a camera, random unless given."""
 
     def __init__(self, seed: int, config: WorldConfig = WorldConfig(), camera: Camera | None = None) -> None:  # noqa: B008
         rng = np.random.default_rng([seed, 2])
@@ -98,5 +98,5 @@ class World:
         self._samples = config.samples
 
     def frames(self, count: int, rate_hz: float = 33.0) -> Iterator[WorldFrame]:
-        """`count` frames of a drive from its begin; everybody moves on between them, the ego among them."""
+        """The first `count` frames of a drive; ego and traffic move between them."""
         return drive(self.scenario, self.camera, count, rate_hz, self._samples)

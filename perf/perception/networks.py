@@ -30,7 +30,7 @@ from birdslam.perf.perception import labelled_bodies
 from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
 from birdslam.sources.opening import open_recording
-from birdslam.world.training.grading import LONG, Grades, box_ious, extents, overlap
+from birdslam.world.training.grading import MIN_SIDE_ASPECT, Grades, box_ious, extents, overlap
 
 label = "the shipped network: held-out worlds, and real frames beside LiDAR and two other networks"
 
@@ -136,7 +136,7 @@ def real(network: Network, folder: Path, models: Path) -> dict[str, float]:
         ratios_of = {
             "box_width_ratio": widths,
             "box_height_ratio": heights,
-            "long_box_width_ratio": widths[aspects >= LONG],
+            "long_box_width_ratio": widths[aspects >= MIN_SIDE_ASPECT],
         }
         for name, ratios in ratios_of.items():
             if len(ratios):

@@ -214,7 +214,7 @@ class Training:
 
 
 def write_network(folder: Path, content: bytes, text: str, name: str = NAME) -> None:
-    """A network and its manifest into a folder, each whole or not at all."""
+    """Writes a network and its manifest to a folder, atomically."""
     for suffix, data in ((".onnx", content), (".toml", text.encode())):
         partial = folder / f"{name}{suffix}.part"
         partial.write_bytes(data)

@@ -53,7 +53,7 @@ def plane_bases(corners, count, bases):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def tuck(P, z):  # type: ignore[no-untyped-def]
+def side_inclination(P, z):  # type: ignore[no-untyped-def]
     """How far a body's side leans in at the height z over the road: its normal's fall per its level part."""
     return (0.5 + 0.9 * P[m.SEED]) * min(max(1.0 - (z - P[m.CLEARANCE]) / (0.25 + 0.2 * P[m.RIM]), 0.0), 1.0)
 
@@ -84,7 +84,7 @@ def unit_normal(P, R, mat, w, lx, ly, lz):  # type: ignore[no-untyped-def]
     ny = R[1, 0] * lx + R[1, 1] * ly + R[1, 2] * lz
     nz = R[2, 0] * lx + R[2, 1] * ly + R[2, 2] * lz
     if mat == m.PAINT:  # bumpers and sills turn in towards the road
-        nz -= tuck(P, w) * math.sqrt(nx * nx + ny * ny)
+        nz -= side_inclination(P, w) * math.sqrt(nx * nx + ny * ny)
     norm = 1.0 / math.sqrt(nx * nx + ny * ny + nz * nz + 1e-12)
     return nx * norm, ny * norm, nz * norm
 

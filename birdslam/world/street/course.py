@@ -1,4 +1,4 @@
-"""Where a street leads: the curvature and slope of its centre line. Drawn from a generator."""
+"""Random curvature and slope of a street's centre line."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ import numpy as np
 from birdslam.geometry.arrays import Floats
 
 STEP_M = 0.5  # of the table of the centre line
-# Greatest curvature of a street of a kind, 1/m
-SHARPEST = {"residential": 1 / 18, "urban": 1 / 22, "avenue": 1 / 45, "country": 1 / 50, "motorway": 1 / 300,
+MAX_CURVATURE_PER_M = {"residential": 1 / 18, "urban": 1 / 22, "avenue": 1 / 45, "country": 1 / 50, "motorway": 1 / 300,
              "industrial": 1 / 20, "alley": 1 / 15}  # fmt: skip
 
 
@@ -47,7 +46,7 @@ class Course:
 
 
 def draw_course(rng: np.random.Generator, length_m: float, ego_s_m: float, sharpest: float) -> Course:
-    """Straight, bending or turning sharply; level or graded up to 8 %, sometimes over a crest or through a sag."""
+    """A straight, bending or sharply turning course; level or graded up to 8 %, sometimes with a crest or a sag."""
     n = int(length_m / STEP_M) + 1
     s = np.arange(n, dtype=np.float64) * STEP_M
     curvature = np.zeros(n)
@@ -56,7 +55,7 @@ def draw_course(rng: np.random.Generator, length_m: float, ego_s_m: float, sharp
             curvature += rng.uniform(-1, 1) * sharpest * 0.25 + 0.15 * sharpest * np.sin(s / rng.uniform(20, 60))
         case 2:
             curvature += rng.choice([-1.0, 1.0]) * rng.uniform(0.2, 0.6) * sharpest * _bump(s, rng, ego_s_m, 40.0)
-        case 3:  # a turn of up to a right angle somewhere ahead
+        case 3:  # a turn of up to a right angle ahead
             turn = rng.uniform(0.5, 1.6) * rng.choice([-1.0, 1.0])
             radius = rng.uniform(1.0, 3.0) / sharpest
             begin = ego_s_m + rng.uniform(-10, 60)
@@ -68,7 +67,7 @@ def draw_course(rng: np.random.Generator, length_m: float, ego_s_m: float, sharp
     slope = np.zeros(n)
     if rng.random() < 0.55:
         slope += np.clip(rng.normal(0.0, 0.03), -0.08, 0.08)
-    if rng.random() < 0.3:  # a crest or a sag some way ahead
+    if rng.random() < 0.3:  # a crest or a sag ahead
         begin, radius = ego_s_m + rng.uniform(8, 50), rng.uniform(500, 2500) * rng.choice([-1.0, 1.0])
         slope += np.clip(np.clip(s - begin, 0.0, 60.0) / radius, -0.06, 0.06)
     return Course(curvature, np.clip(slope, -0.08, 0.08))

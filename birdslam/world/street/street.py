@@ -1,6 +1,6 @@
 """A street: its centre line with curves and grades, its cross-section, paint, crossings.
 
-Places on a street are (s, d): metres along the centre line, and metres to the left of it.
+Positions on a street are (s, d): metres along the centre line, and metres to the left of it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MARK = ("kind", "s0", "s1", "d0", "d1", "seed")
 
 @dataclass(frozen=True)
 class Lane:
-    """A lane of traffic: its middle, its direction (1 with s, -1 against it), how fast one drives there."""
+    """A lane of traffic: its centre, its direction (1 with s, -1 against it), and its speed."""
 
     d_m: float
     direction: int
@@ -48,12 +48,12 @@ class Street:
     marks: Floats32
     lanes: tuple[Lane, ...]
     parking: tuple[tuple[float, int], ...]  # (d, direction) of the middle of parking strips
-    right_m: float  # edges of what is driven on, parking strips too
+    right_m: float  # edges of the drivable road with parking strips
     left_m: float
-    front_right_m: float  # where gardens or fields begin
+    front_right_m: float  # start of gardens or fields
     front_left_m: float
-    built: float  # how densely houses stand, 0-1
-    green: float  # how many trees, 0-1
+    built: float  # density of houses, 0-1
+    green: float  # density of trees, 0-1
 
     @property
     def length_m(self) -> float:
@@ -73,7 +73,7 @@ class Street:
         return x, y, z, yaw, rise[i] * (1.0 - f) + rise[i + 1] * f
 
     def rise(self, s_m: float, d_m: float) -> float:
-        """How high over the road's plane the ground at (s, d) is: kerbs and what lies behind them."""
+        """Height of the ground at (s, d) over the road's plane: kerbs and the ground behind them."""
         if self.in_crossing(s_m, 2.0, 1 if d_m > 0.0 else -1):
             return 0.0
         for d0, d1, z0, z1 in self.bands[:, :4].tolist():
@@ -91,7 +91,7 @@ class Street:
         return float(self.yaw_rad[i + 4] - self.yaw_rad[i - 4]) / (8.0 * STEP_M)
 
     def in_crossing(self, s: float, margin_m: float, side: int = 0) -> bool:
-        """Within a crossing's width and the margin; of those with a road to that side (1 left, -1 right, 0 any)."""
+        """Whether s is within a crossing and the margin; `side`: only with a road to the left (1), right (-1), any (0)."""
         return any(
             abs(s - row[0]) < row[1] + margin_m and (side == 0 or row[2 if side > 0 else 3] > 0.5)
             for row in self.crossings

@@ -1,11 +1,11 @@
-"""A street drawn from a generator: lanes and their lines, what lies beside them, crossings, paint across the road."""
+"""Draws a random street: lanes and their lines, roadsides, crossings, paint across the road."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from birdslam.geometry.arrays import Floats32
-from birdslam.world.street.course import SHARPEST, Course, draw_course
+from birdslam.world.street.course import MAX_CURVATURE_PER_M, Course, draw_course
 from birdslam.world.street.street import (
     ARROW,
     ASPHALT,
@@ -42,9 +42,9 @@ _SPEED_MPS = {"residential": 9.0, "urban": 13.0, "avenue": 14.0, "country": 22.0
 def draw_street(
     rng: np.random.Generator, length_m: float, ego_s_m: float, kind: str | None = None, course: Course | None = None
 ) -> Street:
-    """A street of a kind (drawn unless given), `length_m` long, with its bends about `ego_s_m` where the ego is."""
+    """A street of a kind (random unless given), `length_m` long, with its bends around the ego at `ego_s_m`."""
     kind = kind or str(rng.choice(_KINDS, p=_ODDS))
-    course = course or draw_course(rng, length_m, ego_s_m, SHARPEST[kind])
+    course = course or draw_course(rng, length_m, ego_s_m, MAX_CURVATURE_PER_M[kind])
     u = rng.random(40)
     wide = {"motorway": 3.6, "avenue": 3.25, "country": 3.2, "alley": 2.4}.get(kind, 3.0)
     width = wide + 0.5 * (u[0] - 0.4)
@@ -97,7 +97,7 @@ def draw_street(
 
 
 def _lane_counts(rng: np.random.Generator, kind: str) -> tuple[int, int, float]:
-    """Lanes forth and back, and the width of what parts them."""
+    """Lanes forth and back, and the width of the median."""
     if kind == "motorway":
         return int(rng.integers(2, 5)), int(rng.choice([0, 2, 3])), float(rng.uniform(1.5, 6.0))
     if kind == "avenue":
@@ -112,7 +112,7 @@ def _lane_counts(rng: np.random.Generator, kind: str) -> tuple[int, int, float]:
 
 
 class _Side:
-    """What lies beside the lanes on one side: parking, cycle lane, kerb, verge, pavement."""
+    """One roadside: parking, cycle lane, kerb, verge, pavement."""
 
     def __init__(self, rng: np.random.Generator, kind: str) -> None:
         u = rng.random(12)
@@ -129,7 +129,7 @@ class _Side:
     def bands(
         self, edge: float, sign: float, tone: float, limit_m: float
     ) -> tuple[list[tuple[float, ...]], float | None, float, float]:
-        """Bands outwards from the edge of the lanes; the parking strip's middle, road's edge, and front's edge."""
+        """Bands outwards from the edge of the lanes; the parking strip's centre, the edges of road and front."""
         rows: list[tuple[float, ...]] = []
         at, z, strip = edge, 0.0, None
 

@@ -1,5 +1,5 @@
-"""Who and what is on a street of the built-in world, and how it moves; numpy alone.
+"""Road users and scenery on a street of the built-in world, and their motion; numpy only.
 
-Read `flow` first: `populate` puts traffic on a street, `advance` moves it. `poses` takes (s, d) on the street to
+Read `flow` first: `populate` places traffic on a street, `advance` moves it. `poses` converts (s, d) on the street to
 poses in world.
 """

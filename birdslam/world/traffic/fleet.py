@@ -88,7 +88,7 @@ _CAR_ODDS = (0.27, 0.1, 0.17, 0.05, 0.14, 0.1, 0.1, 0.02, 0.03, 0.02)
 
 @dataclass(frozen=True)
 class Body:
-    """Something that can move: what it is, its mesh's kind, and its parameters (SLOTS,)."""
+    """A movable body: its label, its mesh's kind, and its parameters (SLOTS,)."""
 
     label: str
     kind: int
@@ -96,7 +96,7 @@ class Body:
 
 
 def draw_vehicle(rng: np.random.Generator, parked: bool = False) -> Body:
-    """A car mostly; also vans, trucks, buses."""
+    """A random vehicle: mostly cars, also vans, trucks and buses."""
     p = rng.random()
     if p < (0.88 if parked else 0.76):
         return draw_shape(rng, str(rng.choice(_CARS, p=_CAR_ODDS)))
@@ -156,7 +156,7 @@ def _paint(rng: np.random.Generator, P: Floats32, label: str) -> None:
 
 
 def draw_truck(rng: np.random.Generator) -> Body:
-    """A rigid or an articulated truck with one of several loads; `van`-sized ones count as trucks too."""
+    """A rigid or articulated truck with a random load; van-sized ones are labelled as trucks too."""
     P = np.zeros(m.SLOTS, np.float32)
     u = rng.random(16)
     length = (6.0 + 2.3 * u[0], 8.6 + 3.0 * u[0], 13.0 + 3.5 * u[0])[int(rng.choice(3, p=[0.4, 0.3, 0.3]))]

@@ -1,7 +1,7 @@
-"""Who is on a street and how they move: traffic in its lanes, parked cars, people. Continuous in time.
+"""Traffic simulation: vehicles in lanes, parked cars, people. Continuous in time.
 
-Drivers follow the intelligent driver model (Treiber, Hennecke, Helbing, 2000): they hold a speed and keep a gap to
-whoever is ahead in their lane, and change lanes smoothly to overtake.
+Drivers follow the intelligent driver model (Treiber, Hennecke, Helbing, 2000): they hold a speed, keep a gap to the
+vehicle ahead in their lane, and change lanes smoothly to overtake.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from birdslam.world.traffic.fleet import Body, draw_cyclist, draw_pedestrian, dr
 from birdslam.world.traffic.parking import Lot, Row, kerb_rows
 
 ACCELERATION_MPS2, BRAKING_MPS2, GAP_S, GAP_M = 1.5, 2.2, 1.3, 2.2
-CHANGE_S = 3.5  # how long a change of lane takes
+CHANGE_S = 3.5  # duration of a lane change
 
 
 @dataclass
 class Mover:
-    """A body at (s, d), turned by `turn_rad` against the street, moving at `speed_mps` along its own x."""
+    """A body at (s, d), rotated by `turn_rad` relative to the street, moving at `speed_mps` along its x axis."""
 
     body: Body
     s_m: float
@@ -30,13 +30,13 @@ class Mover:
     turn_rad: float
     speed_mps: float = 0.0
     wish_mps: float = 0.0
-    lane_d_m: float | None = None  # the middle of its lane; None: it follows no lane
+    lane_d_m: float | None = None  # centre of its lane; None: it follows no lane
     drift_mps: float = 0.0  # across the street
     acceleration_mps2: float = 0.0
     phase_per_m: float = 0.0
-    stops: tuple[tuple[float, float], ...] = ()  # (s, until when): a red light
-    plan: list[tuple[float, float, float]] = field(default_factory=list)  # (from s on, lane's d, wished speed)
-    walks: list[tuple[float, float, float]] = field(default_factory=list)  # who follows no lane: (from t_s, turn, m/s)
+    stops: tuple[tuple[float, float], ...] = ()  # (s, end time): a red light
+    plan: list[tuple[float, float, float]] = field(default_factory=list)  # (from s, lane's d, desired speed)
+    walks: list[tuple[float, float, float]] = field(default_factory=list)  # without lane: (from t_s, turn, m/s)
 
     @property
     def direction(self) -> int:
@@ -44,7 +44,7 @@ class Mover:
 
     @property
     def velocity(self) -> tuple[float, float]:
-        """Along the street and across it, m/s."""
+        """Velocity along the street and across it, m/s."""
         if self.lane_d_m is None:
             return self.speed_mps * math.cos(self.turn_rad), self.speed_mps * math.sin(self.turn_rad)
         return self.speed_mps * self.direction, self.drift_mps
@@ -62,14 +62,14 @@ def populate(
     rng: np.random.Generator, street: Street, ego_s_m: float, ego_d_m: float, reach_m: float = 110.0,
     lots: tuple[Lot, ...] = (),
 ) -> list[Mover]:  # fmt: skip
-    """Traffic, parked cars and people about the ego; nobody stands in anybody, nor where the ego is."""
+    """Traffic, parked cars and people around the ego, without overlaps."""
     u = rng.random(8)
     dense = u[0] ** 1.3
     taken: list[tuple[float, float, float, float, Row | None]] = [(ego_s_m - 1.0, ego_d_m, 3.5, 1.1, None)]
     out: list[Mover] = []
 
     def add(mover: Mover, margin_m: float, row: Row | None = None) -> bool:
-        """Where cars stand aslant in a `row`, the boxes about them overlap: there it is the row that spaces them."""
+        """Adds a mover unless it overlaps; in a `row` its spacing replaces this test, since angled boxes overlap."""
         cos, sin = abs(math.cos(mover.turn_rad)), abs(math.sin(mover.turn_rad))
         hs = 0.5 * (cos * mover.length_m + sin * mover.width_m)
         hd = 0.5 * (cos * mover.width_m + sin * mover.length_m)
@@ -110,7 +110,7 @@ def populate(
 
 
 def _pass(rng: np.random.Generator, street: Street, ego_s_m: float, ego_d_m: float, add) -> None:  # type: ignore[no-untyped-def]
-    """Trucks, buses and vans close beside the ego, so that the image's border cuts them; some fill a side of it."""
+    """Trucks, buses and vans close beside the ego, which the image border truncates."""
     near = [lane for lane in street.lanes if 2.4 < abs(lane.d_m - ego_d_m) < 4.8]
     if near:
         lane = near[int(rng.integers(0, len(near)))]
@@ -127,7 +127,7 @@ def _pass(rng: np.random.Generator, street: Street, ego_s_m: float, ego_d_m: flo
 
 
 def _park(rng: np.random.Generator, rows: list[Row], street: Street, add) -> None:  # type: ignore[no-untyped-def]
-    """Cars in their rows: along a kerb most are headed as the traffic goes, those across stand either way."""
+    """Parked cars in rows: along a kerb mostly in the direction of traffic, perpendicular ones either way."""
     for row in rows:
         pitch = row.pitch_m
         s = row.s0_m + rng.uniform(0.0, pitch)
@@ -145,7 +145,7 @@ def _park(rng: np.random.Generator, rows: list[Row], street: Street, add) -> Non
 
 
 def _cross(rng, street: Street, ego_s_m: float, reach_m: float, add) -> None:  # type: ignore[no-untyped-def]
-    """Cars on side roads, waiting or coming; some in the middle of a turn."""
+    """Cars on side roads, waiting, approaching or turning."""
     for s, half, left, right, *_ in street.crossings.tolist():
         if not ego_s_m - 10.0 < s < ego_s_m + reach_m:
             continue
@@ -190,8 +190,8 @@ def _walk(rng, street: Street, ego_s_m: float, reach_m: float, add, busy: float)
         add(Mover(body, s, d, turn, speed, speed, phase_per_m=4.3 if body.kind == m.PEDESTRIAN else 1.1), 0.1)
 
 
-def settle(movers: list[Mover], street: Street) -> list[Mover]:
-    """For a drive: who follows no lane waits where they are, but for people beside the road, who go along it."""
+def set_initial_motion(movers: list[Mover], street: Street) -> list[Mover]:
+    """Prepares a drive: movers without lane stop, except people beside the road, who walk along it."""
     for mover in movers:
         walks = mover.body.kind in (m.PEDESTRIAN, m.CYCLIST) and not street.right_m < mover.d_m < street.left_m
         if mover.lane_d_m is None and walks:
@@ -208,7 +208,7 @@ def _parks(mover: Mover, street: Street) -> bool:
 
 
 def advance(movers: list[Mover], ego: Mover, street: Street, t_s: float, dt_s: float) -> None:
-    """Everybody, the ego too, moves on by `dt_s` from the time `t_s`."""
+    """Moves all movers and the ego by `dt_s` from the time `t_s`."""
     everyone = [*movers, ego]
     for mover in everyone:
         if mover.lane_d_m is None:
@@ -223,7 +223,7 @@ def advance(movers: list[Mover], ego: Mover, street: Street, t_s: float, dt_s: f
 
 
 def _follow(mover: Mover, everyone: list[Mover], street: Street, t_s: float, dt_s: float) -> None:
-    """One driver's step along their lane."""
+    """One step of the driver model."""
     while mover.plan and (mover.s_m - mover.plan[0][0]) * mover.direction >= 0.0:
         _, mover.lane_d_m, mover.wish_mps = mover.plan.pop(0)
     gap, closing = _ahead(mover, everyone, t_s)
@@ -239,7 +239,7 @@ def _follow(mover: Mover, everyone: list[Mover], street: Street, t_s: float, dt_
     mover.body.parameters[m.BRAKING] = float(mover.acceleration_mps2 < -0.4 or mover.speed_mps < 0.2)
     step_m = 0.5 * (v + mover.speed_mps) * dt_s
     lane = mover.lane_d_m if mover.lane_d_m is not None else mover.d_m
-    w = 4.0 / CHANGE_S  # towards the lane's middle like a critically damped spring, never sideways
+    w = 4.0 / CHANGE_S  # towards the lane's centre like a critically damped spring, proportional to speed
     mover.drift_mps += (w * w * (lane - mover.d_m) - 2.0 * w * mover.drift_mps) * dt_s
     limit = 0.2 * mover.speed_mps
     mover.drift_mps = min(max(mover.drift_mps, -limit), limit)
@@ -252,7 +252,7 @@ def _follow(mover: Mover, everyone: list[Mover], street: Street, t_s: float, dt_
 
 
 def _ahead(mover: Mover, everyone: list[Mover], t_s: float) -> tuple[float, float]:
-    """Metres to what is next in the way, and how fast they shrink."""
+    """Gap to the next obstacle in metres, and its closing speed."""
     gap, closing = 1e3, 0.0
     lane = mover.lane_d_m if mover.lane_d_m is not None else mover.d_m
     for other in everyone:

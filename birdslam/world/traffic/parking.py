@@ -1,4 +1,4 @@
-"""Where cars park: along kerbs, across or aslant before houses, and in rows on lots beside the street."""
+"""Parking: along kerbs, perpendicular or angled in front of houses, and on lots beside the street."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 
 from birdslam.world.rendering import materials as m
 from birdslam.world.street.street import Street
-from birdslam.world.traffic.placement import Standing
+from birdslam.world.traffic.placement import Scenery
 
-ALONG_M, ACROSS_M = 6.2, 2.8  # from one car to the next
-_ROW_M, _AISLE_M = 5.0, 5.5  # depth of a row that stands across, and of the way between two
+ALONG_M, ACROSS_M = 6.2, 2.8  # spacing of parallel and perpendicular places
+_ROW_M, _AISLE_M = 5.0, 5.5  # depth of a perpendicular row, and of the aisle between two rows
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Row:
 
     d_m: float
     turn_rad: float
-    odds: float  # that a place is taken
+    odds: float  # probability that a place is taken
     s0_m: float
     s1_m: float
 
@@ -31,36 +31,36 @@ class Row:
 
     @property
     def pitch_m(self) -> float:
-        """From one place to the next, along the street."""
+        """Spacing of places along the street."""
         return ALONG_M if self.along else ACROSS_M / abs(math.sin(self.turn_rad))
 
 
 @dataclass(frozen=True)
 class Lot:
-    """Rows of places on a piece of ground beside the street, where nothing is built."""
+    """Rows of places on free ground beside the street."""
 
     s0_m: float
     s1_m: float
     near_m: float  # its side towards the street, d
     far_m: float
     rows: tuple[Row, ...]
-    border_m: float  # height of what grows along the street's side of it; 0: nothing
+    border_m: float  # height of the hedge towards the street; 0: none
 
 
 def kerb_rows(rng: np.random.Generator, street: Street, full: float, s0_m: float, s1_m: float) -> list[Row]:
-    """Rows that the street's cross-section has or bears; `full` in [0, 1]."""
+    """Rows along the kerbs that the street's cross-section allows; `full` in [0, 1] is the occupancy."""
     rows = [Row(d, 0.0 if direction >= 0 else math.pi, 0.5 + 0.5 * full, s0_m, s1_m) for d, direction in street.parking]
     if street.kind in ("residential", "urban", "industrial", "alley"):
         for edge, front, sign in ((street.right_m, street.front_right_m, -1), (street.left_m, street.front_left_m, 1)):
             if rng.random() < 0.25:  # two wheels on the pavement
                 rows.append(Row(edge + sign * 0.8, math.pi if sign > 0 else 0.0, 0.15 + 0.5 * full, s0_m, s1_m))
-            if rng.random() < 0.25:  # before houses, across
+            if rng.random() < 0.25:  # perpendicular, in front of houses
                 rows.append(Row(front + sign * 3.2, 0.5 * math.pi, 0.4 * full, s0_m, s1_m))
     return rows
 
 
 def draw_lots(rng: np.random.Generator, street: Street, ego_s_m: float) -> tuple[Lot, ...]:
-    """Up to two on each side of a street in a town: bays aslant or across, or a car park of several rows."""
+    """Up to two lots on each side of a town street: angled or perpendicular bays, or a car park of several rows."""
     if street.kind in ("country", "motorway"):
         return ()
     out: list[Lot] = []
@@ -82,7 +82,7 @@ def draw_lots(rng: np.random.Generator, street: Street, ego_s_m: float) -> tuple
 
 
 def _level(street: Street, s0_m: float, s1_m: float, far_m: float) -> bool:
-    """No side road runs through it, and no bend folds it."""
+    """Whether no side road and no sharp bend crosses the lot."""
     side = 1 if far_m > 0.0 else -1
     stations = np.arange(s0_m, s1_m, 4.0)
     return not any(street.in_crossing(s, 6.0, side) or street.curvature(s) * far_m > 0.6 for s in stations)
@@ -99,16 +99,16 @@ def _lot(
     out, at = [], near_m + sign * (0.5 + 0.5 * _ROW_M)
     for index in range(rows):
         out.append(Row(at, 0.0 if along else turn, odds, s0_m + 1.5, s1_m - 1.5))
-        # Two rows nose to nose, then a way between
+        # Two rows nose to nose, then an aisle
         at += sign * ((_ROW_M if index % 2 else _ROW_M + _AISLE_M) if rows > 1 else 0.0) * (0.55 if along else 1.0)
     far_m = out[-1].d_m + sign * (0.5 * _ROW_M + 0.5)
     border = float(rng.uniform(0.15, 0.7)) if rng.random() < 0.4 else 0.0
     return Lot(s0_m, s1_m, near_m, far_m, tuple(out), border)
 
 
-def cleared(standing: Standing, lots: tuple[Lot, ...], rng: np.random.Generator) -> Standing:
-    """What stands, with the lots free: houses stand behind them, and what grows there grows along their borders."""
-    out = Standing([], [], [], [], [])
+def cleared(standing: Scenery, lots: tuple[Lot, ...], rng: np.random.Generator) -> Scenery:
+    """Moves scenery off the lots: houses behind them, plants to their borders."""
+    out = Scenery([], [], [], [], [])
     columns = (standing.kind, standing.s_m, standing.d_m, standing.turn_rad, standing.parameters)
     for kind, s_m, d_m, turn_rad, P in zip(*columns, strict=True):
         along, across = float(P[m.LENGTH]), float(P[m.WIDTH])

@@ -1,4 +1,4 @@
-"""What stands along a street: houses, trees, hedges, posts, signs, bridges, and boxes that only look like vehicles."""
+"""Places scenery along a street: houses, trees, hedges, posts, signs, bridges, and boxes that resemble vehicles."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ _ROOFS = np.array([(0.2, 0.07, 0.04), (0.06, 0.055, 0.055), (0.13, 0.09, 0.07), 
 
 
 @dataclass
-class Standing:
-    """Rows of what stands: kind, (s, d) on the street, turn against the street's heading, parameters."""
+class Scenery:
+    """Static objects, row by row: kind, (s, d) on the street, rotation relative to the street, parameters."""
 
     kind: list[int]
     s_m: list[float]
@@ -29,7 +29,7 @@ class Standing:
     parameters: list[Floats32]
 
     def add(self, kind: int, s_m: float, d_m: float, turn_rad: float, size: tuple[float, float, float]) -> Floats32:
-        """A new one; its parameters, to be filled further."""
+        """Adds an object; returns its parameters for further changes."""
         P = np.zeros(m.SLOTS, np.float32)
         P[m.LENGTH], P[m.WIDTH], P[m.HEIGHT] = size
         self.kind.append(kind)
@@ -40,9 +40,9 @@ class Standing:
         return P
 
 
-def furnish(rng: np.random.Generator, street: Street, s0_m: float, s1_m: float) -> Standing:
-    """Everything that stands between s0 and s1, on both sides and behind."""
-    out = Standing([], [], [], [], [])
+def furnish(rng: np.random.Generator, street: Street, s0_m: float, s1_m: float) -> Scenery:
+    """All scenery between s0 and s1, on both sides and in the background."""
+    out = Scenery([], [], [], [], [])
     for sign, front in ((-1.0, street.front_right_m), (1.0, street.front_left_m)):
         _houses(rng, street, out, sign, front, s0_m, s1_m)
         _roadside(rng, street, out, sign, front, s0_m, s1_m)
@@ -55,12 +55,12 @@ def furnish(rng: np.random.Generator, street: Street, s0_m: float, s1_m: float) 
 
 
 def _free(street: Street, s: float, d: float, reach_m: float) -> bool:
-    """Nothing would stand on a crossing or in the inner bend of a curve."""
+    """Whether (s, d) is neither on a crossing nor inside a sharp bend."""
     side = 1 if d > 0 else -1
     return not street.in_crossing(s, reach_m + 2.0, side) and street.curvature(s) * d < 0.7
 
 
-def tree(rng: np.random.Generator, out: Standing, s: float, d: float, h: float, kind: int, cards: int) -> None:
+def tree(rng: np.random.Generator, out: Scenery, s: float, d: float, h: float, kind: int, cards: int) -> None:
     u = rng.random(4)
     width = h * ((0.55 + 0.5 * u[0]) if kind == 0 else ((0.9 + u[0]) if kind == 1 else (0.3 + 0.2 * u[0])))
     P = out.add(m.TREE, s, d, 0.0, (width, width, h))
@@ -73,7 +73,7 @@ def tree(rng: np.random.Generator, out: Standing, s: float, d: float, h: float, 
 
 
 def _houses(
-    rng: np.random.Generator, street: Street, out: Standing, sign: float, front: float, s0: float, s1: float
+    rng: np.random.Generator, street: Street, out: Scenery, sign: float, front: float, s0: float, s1: float
 ) -> None:
     setback = float(rng.choice([0.0, rng.uniform(1.0, 4.0), rng.uniform(4.0, 14.0)], p=[0.3, 0.4, 0.3]))
     row = rng.random() < 0.4  # wall to wall
@@ -108,7 +108,7 @@ def _houses(
 
 
 def _garden(
-    rng: np.random.Generator, out: Standing, s: float, d: float, long: float, kind: int, setback: float, sign: float
+    rng: np.random.Generator, out: Scenery, s: float, d: float, long: float, kind: int, setback: float, sign: float
 ) -> None:
     if kind == 1:
         h = float(rng.uniform(0.7, 2.0))
@@ -127,7 +127,7 @@ def _garden(
 
 
 def _roadside(
-    rng: np.random.Generator, street: Street, out: Standing, sign: float, front: float, s0: float, s1: float
+    rng: np.random.Generator, street: Street, out: Scenery, sign: float, front: float, s0: float, s1: float
 ) -> None:
     edge = street.left_m if sign > 0 else street.right_m
     wide = abs(front - edge)
@@ -175,9 +175,9 @@ def _roadside(
 
 
 def background(
-    rng: np.random.Generator, street: Street, out: Standing, sign: float, front: float, s0: float, s1: float
+    rng: np.random.Generator, street: Street, out: Scenery, sign: float, front: float, s0: float, s1: float
 ) -> None:
-    """Trees and blocks further off, so that streets do not end in an empty sky."""
+    """Distant trees and blocks, so that streets do not end in an empty sky."""
     d = abs(front) + 18.0
     wood = rng.random() < 0.5
     kind = 0 if rng.random() < 0.7 else 2
@@ -203,7 +203,7 @@ def background(
             P[14:17], P[20], P[m.SEED] = _ROOFS[int(4 * u[3])], -1, u[4]
 
 
-def _over_the_road(rng: np.random.Generator, street: Street, out: Standing, s0: float, s1: float) -> None:
+def _over_the_road(rng: np.random.Generator, street: Street, out: Scenery, s0: float, s1: float) -> None:
     if rng.random() < (0.35 if street.kind in ("motorway", "avenue") else 0.06):
         reach = max(abs(street.left_m), abs(street.right_m)) + 1.5
         P = out.add(
@@ -218,7 +218,7 @@ def _over_the_road(rng: np.random.Generator, street: Street, out: Standing, s0: 
         s = float(rng.uniform(s0 + 30, s1))
         P = out.add(m.SIGN, s, street.right_m - 0.8, 0.0, (0.1, 3.0, 7.0))
         P[8], P[9], P[10], P[:3], P[m.PICTURE] = 6.5, 3.0, 3.5, (0.02, 0.06, 0.3), rng.integers(0, 16)
-    # where the street ends in sight, something stands
+    # an object at the visible end of the street
     for d in np.arange(-40.0, 41.0, 9.0):
         tree(
             rng,
@@ -232,9 +232,9 @@ def _over_the_road(rng: np.random.Generator, street: Street, out: Standing, s0: 
 
 
 def _corner(
-    rng: np.random.Generator, street: Street, out: Standing, s: float, half: float, left: float, right: float
+    rng: np.random.Generator, street: Street, out: Scenery, s: float, half: float, left: float, right: float
 ) -> None:
-    """Lights at a crossing, houses at the far ends of its roads."""
+    """Traffic lights at a crossing, houses at the far ends of its side roads."""
     if rng.random() < 0.3:
         arm = float(rng.choice([0.0, rng.uniform(2.0, 5.0)]))
         for sign, edge in ((-1.0, street.right_m), (1.0, street.left_m)):

@@ -1,4 +1,4 @@
-"""Where things on a street are in world, and the ego over it."""
+"""Poses in world of the ego and of bodies on a street."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from birdslam.world.rendering import materials as m
 from birdslam.world.rendering.scene import Bodies
 from birdslam.world.street.street import Street
 from birdslam.world.traffic.flow import Mover
-from birdslam.world.traffic.placement import Standing
+from birdslam.world.traffic.placement import Scenery
 
 
 def ego_pose(street: Street, s_m: float, d_m: float, turn_rad: float) -> Floats:
-    """(4, 4) ego in world: on the road at (s, d), x turned from the street's heading in the road's plane."""
+    """`T_world_ego` (4, 4) on the road at (s, d), rotated by `turn_rad` from the street's heading in the road plane."""
     x, y, z, yaw, slope = (float(v) for v in street.place(np.array(s_m), np.array(d_m)))
     along = np.array([math.cos(yaw), math.sin(yaw), slope])
     along /= np.linalg.norm(along)
@@ -27,8 +27,8 @@ def ego_pose(street: Street, s_m: float, d_m: float, turn_rad: float) -> Floats:
     return out
 
 
-def place(street: Street, standing: Standing) -> Bodies:
-    """What stands, in world."""
+def place(street: Street, standing: Scenery) -> Bodies:
+    """The scenery as bodies in world."""
     s, d = np.array(standing.s_m), np.array(standing.d_m)
     x, y, z, yaw, _ = street.place(s, d)
     n = len(s)
@@ -39,7 +39,7 @@ def place(street: Street, standing: Standing) -> Bodies:
 
 
 def moving(street: Street, movers: list[Mover]) -> Bodies:
-    """Everybody who can move, in world; the object_id is the place in the list."""
+    """The movers as bodies in world; the object_id is the index in the list."""
     s, d = np.array([v.s_m for v in movers]), np.array([v.d_m for v in movers])
     turn = np.array([v.turn_rad for v in movers])
     x, y, z, yaw, slope = street.place(s, d)

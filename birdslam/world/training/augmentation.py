@@ -1,6 +1,6 @@
-"""What a camera, a lens, an exposure and a compression can do to an image: more of it than the renderer draws.
+"""Image augmentation: effects of camera, lens, exposure and compression, stronger than in the renderer.
 
-Strong photometric augmentation is what carries a network from rendered frames to real ones.
+Strong photometric augmentation lets the network generalize from rendered to real images.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from birdslam.world.training.targets import Window
 
 
 class AugmentationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How often what happens; the strengths are drawn within what cameras do."""
+    """Probabilities of the effects; their strengths are random within the range of real cameras."""
 
     mirror: float = 0.5
     crop: float = 0.5
@@ -35,7 +35,7 @@ class AugmentationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True
 
 
 def draw_window(width_px: int, height_px: int, config: AugmentationConfig, rng: np.random.Generator) -> Window:
-    """A window of a frame: the whole, a crop, or a column that the input's aspect squeezes."""
+    """A random window of a frame: the whole, a crop, or a column that is squeezed to the input's aspect ratio."""
     wide, tall = 1.0, 1.0
     if rng.random() < config.squeeze:
         wide = rng.uniform(0.4, 0.8)
@@ -49,7 +49,7 @@ def draw_window(width_px: int, height_px: int, config: AugmentationConfig, rng: 
 
 
 def photometric(image: NDArray[np.uint8], config: AugmentationConfig, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """The image (H, W, 3) as another camera under another light would have taken it."""
+    """Augments an image (H, W, 3) as if from another camera in other light."""
     height_px, width_px = image.shape[:2]
 
     def happens(probability: float) -> bool:
@@ -127,7 +127,7 @@ def _equalised(pixels: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[n
 
 
 def _hide(image: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Small patches of one colour or of noise: dirt, and nothing that a label should hang on."""
+    """Small patches of one colour or of noise, such as dirt."""
     height_px, width_px = image.shape[:2]
     out = image.copy()
     for _ in range(int(rng.integers(1, 5))):

@@ -1,4 +1,4 @@
-"""A trained network as ONNX, in fp32 and in int8, with the manifest that goes with it."""
+"""Exports a trained network as ONNX with its manifest."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ depth_sigma_rel = {depth_sigma_rel:.2f}
 
 
 def to_onnx(network: MultiTask, width_px: int, height_px: int) -> bytes:
-    """The network as an ONNX file for one image of a size."""
+    """The network as an ONNX file for batch 1 at this image size."""
     return onnx_file(network, torch.zeros(1, 3, height_px, width_px), INPUT, OUTPUTS)
 
 
 def onnx_file(
     network: nn.Module, example: Tensor, name: str, outputs: Sequence[str], count: str | None = None
 ) -> bytes:
-    """Of a network with one input `name`, as it is used: for as many rows as `example` has, or any `count` of them."""
+    """The ONNX file of a network in inference mode, for the batch size of `example` or a variable one named `count`."""
     file = io.BytesIO()
     torch.onnx.export(
         copy.deepcopy(network).cpu().eval().float(),
@@ -71,7 +71,7 @@ def manifest(
     lane_logit: float,
     depth_sigma_rel: float,
 ) -> str:
-    """The text of the manifest of an exported network: vehicles count from `score` on, markings from `lane_logit`."""
+    """The manifest of an exported network, with thresholds `score` for vehicles and `lane_logit` for markings."""
     return MANIFEST.format(
         title=title,
         parameters=parameters,

@@ -1,4 +1,4 @@
-"""How good findings are against a rendered frame's truth. Counts are summed over frames, rates come at the end."""
+"""Evaluates findings against a rendered frame's truth. Counts are summed over frames; `figures` gives the rates."""
 
 from __future__ import annotations
 
@@ -16,28 +16,28 @@ from birdslam.world.truth import CLASSES, WorldFrame, WorldObject
 
 _ROAD, _LANE = (CLASSES.index(name) for name in ("road", "lane"))
 _VEHICLES = ("car", "van", "truck", "bus")
-CLEAR = 0.9  # of a body is seen where its whole outline is
-LONG = 2.0  # width over height of the box of a vehicle that is seen from the side
+MIN_VISIBLE_RATIO = 0.9  # of a body with a complete outline
+MIN_SIDE_ASPECT = 2.0  # width over height of the box of a vehicle seen from the side
 
 
 class GradingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What counts. The bars for a vehicle are KITTI's "moderate": 25 px of 375, at most half hidden, 30 % cut off."""
+    """Thresholds. Those of vehicles are KITTI's "moderate": 25 px of 375, at most half hidden, 30 % truncated."""
 
     min_height_rel: float = 25.0 / 375.0  # of the image's height
     min_visible: float = 0.5
     max_truncated: float = 0.3
     iou: float = 0.5
-    lane_grid_px: tuple[int, int] = (320, 96)  # markings are compared on the network's mask: a cell is one where
-    lane_share: float = 0.25  # paint covers so much of it
+    lane_grid_px: tuple[int, int] = (320, 96)  # grid of the network's mask, for markings
+    lane_share: float = 0.25  # min. share of paint in a cell that counts as marking
     depth_max_m: float = 80.0
     near_m: float = 10.0  # the range of the bird's-eye figures
     far_m: float = 30.0
-    score: float = 0.3  # of the boxes whose bodies are judged
+    score: float = 0.3  # min. score of the boxes whose bodies are evaluated
 
 
 @dataclass
 class Grades:
-    """Sums and samples over frames; `figures` makes the rates of them."""
+    """Sums and samples over frames; `figures` gives the rates."""
 
     config: GradingConfig = field(default_factory=GradingConfig)
     frames: int = 0
@@ -47,16 +47,16 @@ class Grades:
     scores: list[float] = field(default_factory=list)
     hits: list[bool] = field(default_factory=list)
     vehicles: int = 0
-    axis_rad: list[float] = field(default_factory=list)  # error of the axis alone
+    axis_rad: list[float] = field(default_factory=list)  # error of the axis, modulo pi
     flipped: list[bool] = field(default_factory=list)
     centre_rel: list[float] = field(default_factory=list)  # of the depth, at near_m to far_m
     size_rel: list[Floats] = field(default_factory=list)
     depth_z: list[float] = field(default_factory=list)  # error over stated sigma
-    edge_rel: list[float] = field(default_factory=list)  # of each edge of a box that nothing hides, over its side
+    edge_rel: list[float] = field(default_factory=list)  # error of each edge of an unoccluded box, over its side
     extents: list[Floats] = field(default_factory=list)  # of such boxes, see `extents`
 
     def add(self, findings: Findings, frame: WorldFrame) -> None:
-        """One frame. Findings are of its image at any network size."""
+        """Adds one frame; the findings refer to its image."""
         self.frames += 1
         if findings.depth is not None:
             depth_m = findings.depth.in_metres(frame.camera).depth_m
@@ -94,7 +94,7 @@ class Grades:
                     continue
                 self.scores.append(float(found.scores[row]))
                 self.hits.append(True)
-                if vehicles[best].visible > CLEAR and vehicles[best].truncated == 0.0:
+                if vehicles[best].visible > MIN_VISIBLE_RATIO and vehicles[best].truncated == 0.0:
                     sides = np.tile(truth[best, 2:] - truth[best, :2], 2)
                     self.edge_rel += (np.abs(found.boxes_px[row] - truth[best]) / sides).tolist()
                     if found.scores[row] >= config.score:
@@ -130,7 +130,7 @@ class Grades:
             self.centre_rel.append(math.hypot(x_m - pose.x_m, y_m - pose.y_m) / depth_m)
 
     def figures(self) -> dict[str, float]:
-        """The rates; NaN where nothing was seen of a kind."""
+        """The rates; NaN without samples."""
         sizes = np.array(self.size_rel).reshape(-1, 3)
         widths, heights, aspects = np.array(self.extents).reshape(-1, 3).T
         return {
@@ -140,28 +140,28 @@ class Grades:
             "lane_iou": _ratio(self.lane),
             "vehicles": self.vehicles,
             "vehicle_ap50": average_precision(self.scores, self.hits, self.vehicles),
-            "vehicle_score": best_score(self.scores, self.hits, self.vehicles),
+            "vehicle_score": best_score_threshold(self.scores, self.hits, self.vehicles),
             "yaw_median_deg": math.degrees(_median(self.axis_rad)),
             "flips": _mean([float(flip) for flip in self.flipped]),
             "centre_median_rel": _median(self.centre_rel),
             "length_median_rel": _median(sizes[:, 0].tolist()),
             "width_median_rel": _median(sizes[:, 1].tolist()),
             "height_median_rel": _median(sizes[:, 2].tolist()),
-            "box_sigma_rel": 1.4826 * _median(self.edge_rel),  # a manifest's box_sigma, with the part in pixels in it
-            "box_width_ratio": _median(widths.tolist()),  # said over true: below 1 is too small
+            "box_sigma_rel": 1.4826 * _median(self.edge_rel),  # box_sigma of a manifest, including the part in pixels
+            "box_width_ratio": _median(widths.tolist()),  # estimated over true: below 1 is too small
             "box_height_ratio": _median(heights.tolist()),
-            "long_box_width_ratio": _median(widths[aspects >= LONG].tolist()),
+            "long_box_width_ratio": _median(widths[aspects >= MIN_SIDE_ASPECT].tolist()),
             "depth_sigma_ratio": 1.4826 * _median([abs(z) for z in self.depth_z]),
         }
 
 
 def _boxes_of(bodies: Sequence[WorldObject]) -> Floats:
-    """(N, 4) in the coordinates of pixels' edges, as boxes found are."""
+    """Boxes (N, 4) in coordinates of pixel edges, as in detections."""
     return np.array([body.box_px for body in bodies], dtype=np.float64).reshape(-1, 4) + 0.5
 
 
 def extents(said: Floats, true: Floats) -> Floats:
-    """(3,) of two boxes: their widths' ratio, their heights', and the true box's width over its height."""
+    """(3,) of two boxes: ratio of widths, ratio of heights, and the aspect ratio of the true box."""
     said_px, true_px = said[2:] - said[:2], true[2:] - true[:2]
     out: Floats = np.append(said_px / true_px, true_px[0] / true_px[1])
     return out
@@ -173,7 +173,7 @@ def overlap(guess: Bools, truth: Bools) -> Ints:
 
 
 def box_ious(a: Floats, b: Floats) -> Floats:
-    """(N, M) overlap over union of boxes (N, 4) and (M, 4)."""
+    """IoU (N, M) of boxes (N, 4) and (M, 4)."""
     low = np.maximum(a[:, None, :2], b[None, :, :2])
     high = np.minimum(a[:, None, 2:], b[None, :, 2:])
     shared = np.prod(np.clip(high - low, 0.0, None), axis=-1)
@@ -183,7 +183,7 @@ def box_ious(a: Floats, b: Floats) -> Floats:
 
 
 def average_precision(scores: list[float], hits: list[bool], truths: int) -> float:
-    """Area under the curve of precision over recall, its precision made monotonous."""
+    """Area under the precision-recall curve, with monotonic precision."""
     if truths == 0:
         return math.nan
     order = np.argsort(-np.array(scores), kind="stable")
@@ -194,8 +194,8 @@ def average_precision(scores: list[float], hits: list[bool], truths: int) -> flo
     return float(np.sum(np.diff(recall) * best))
 
 
-def best_score(scores: list[float], hits: list[bool], truths: int) -> float:
-    """The score from which on precision and recall are best together (F1); NaN where nothing was found."""
+def best_score_threshold(scores: list[float], hits: list[bool], truths: int) -> float:
+    """The score threshold with the best F1; NaN without hits."""
     if not any(hits):
         return math.nan
     order = np.argsort(-np.array(scores), kind="stable")

@@ -1,7 +1,7 @@
-"""ENet (Paszke et al. 2016) on bird's-eye occupancy grids, and the grids of the built-in world that it learns from.
+"""ENet (Paszke et al. 2016) on bird's-eye occupancy grids, and its training grids from the built-in world.
 
-What differs from its paper: pooling is undone by interpolation, since ONNX runs that everywhere, and the input has the
-two channels of road and lane boundary.
+Differences from its paper: interpolation instead of max-unpooling, for ONNX, and two input channels, road and lane
+boundary.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from birdslam.world.truth import CLASSES, WorldFrame
 
 
 class LaneSamplesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What the grids of a simulated drive suffer before the network sees them."""
+    """Errors added to the grids of a simulated drive."""
 
     warm_up_frames: int = 8
     every: int = 2  # frames between two samples of one drive
-    sigma_pitch_rad: float = 0.004  # of the ground plane that the masks are projected with, each frame
-    sigma_drift_rel: float = 0.02  # of the odometry's scale, each drive
-    sigma_turn_rad: float = 0.0015  # of its heading, each frame
-    hidden_share: float = 0.35  # of the frames in which a stretch of the masks is lost
+    sigma_pitch_rad: float = 0.004  # of the ground plane used for projection, per frame
+    sigma_drift_rel: float = 0.02  # of the odometry's scale, per drive
+    sigma_turn_rad: float = 0.0015  # of its heading, per frame
+    hidden_share: float = 0.35  # of the frames in which a part of the masks is lost
     speck_share: float = 0.3  # of the frames with false paint
     lane_lost: float = 0.15  # of the painted pixels, in tiles
 
 
 class _Bottleneck(nn.Module):
-    """A residual block of ENet: down to a quarter of the channels, one convolution, up again."""
+    """A residual block of ENet: reduction to a quarter of the channels, one convolution, expansion."""
 
     def __init__(self, inputs: int, outputs: int, kind: str = "plain", dilation: int = 1, dropout: float = 0.1) -> None:
         super().__init__()
@@ -121,7 +121,7 @@ class ENet(nn.Module):
 
 
 def loss(logits: Tensor, target: Tensor) -> Tensor:
-    """Cross entropy and overlap (soft Dice) of each channel; the boundary's few cells weigh four times."""
+    """Cross entropy and soft Dice of each channel; boundary cells have four times the weight."""
     weight = torch.ones_like(target)
     weight[:, 1] += 3.0 * target[:, 1]
     entropy = functional.binary_cross_entropy_with_logits(logits, target, weight)
@@ -131,11 +131,12 @@ def loss(logits: Tensor, target: Tensor) -> Tensor:
 
 
 def truth_grids(frame: WorldFrame, config: LanesConfig) -> Floats32:
-    """(2, rows, columns) of 0 and 1: the road and its painted lines where they are, hidden or not, dashes joined."""
+    """(2, rows, columns) of 0 and 1: the road and its painted lines, including hidden parts, dashes joined."""
     out = np.zeros((2, *config.shape), dtype=np.float32)
     for polygon in frame.road_m:
         cv2.fillPoly(out[0], [_cells(polygon, config)], (1.0,))
-    out[0] = cv2.morphologyEx(out[0], cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))  # a side road ends at a kerb's gap
+    # Closes the gap between a side road and the kerb
+    out[0] = cv2.morphologyEx(out[0], cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
     for lane in frame.lanes:
         if lane.kind != "kerb" and len(lane.points_m) > 1:
             cv2.polylines(out[1], [_cells(lane.points_m, config)], False, (1.0,), 1)
@@ -143,7 +144,7 @@ def truth_grids(frame: WorldFrame, config: LanesConfig) -> Floats32:
 
 
 def _cells(points_m: Floats, config: LanesConfig) -> NDArray[np.int32]:
-    """(N, 2) OpenCV's (column, row) of points in ego."""
+    """(column, row) (N, 2) in OpenCV's order of points in ego."""
     at = (points_m + np.array([config.behind_m, config.half_width_m])) / config.cell_m - 0.5
     return np.round(np.clip(at[:, ::-1], -10_000, 10_000)).astype(np.int32)
 
@@ -151,7 +152,7 @@ def _cells(points_m: Floats, config: LanesConfig) -> NDArray[np.int32]:
 def samples(
     frames: Iterator[WorldFrame], rng: np.random.Generator, lanes: LanesConfig, config: LaneSamplesConfig
 ) -> Iterator[tuple[Floats32, Floats32]]:
-    """Pairs (gathered grids, true grids) of a drive, its masks, odometry and ground plane as noisy as real ones."""
+    """Pairs (accumulated grids, true grids) of a drive with realistic noise of masks, odometry and ground plane."""
     gathered = AmodalLanes(lanes)
     scale = 1.0 + config.sigma_drift_rel * rng.standard_normal()
     T_world_ego, T_before = SE2(), None
@@ -183,7 +184,7 @@ def _on_road(frame: WorldFrame) -> SE2:
 
 
 def _noisy_masks(frame: WorldFrame, rng: np.random.Generator, config: LaneSamplesConfig) -> Segmentation:
-    """The masks of road and paint as a network might give them: torn edges, lost stretches, false paint."""
+    """The masks of road and paint with typical network errors: rough edges, missing parts, false paint."""
     height, width = frame.classes.shape
     lane = frame.classes == CLASSES.index("lane")
     road = lane | (frame.classes == CLASSES.index("road"))

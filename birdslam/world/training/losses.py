@@ -1,4 +1,4 @@
-"""The loss of the multi-task network: depth, masks, heat of the classes, and the body that each cell states."""
+"""The loss of the multi-task network: depth, masks, class heat maps, and the body of each cell."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from birdslam.perception.decoding.multitask import CLASSES, MEAN_SIZE_M, body_sl
 from birdslam.world.training.targets import COLUMN
 
 _BODY = body_slices()
-_STEEP = 1.0  # of log depth: from there on an error costs in proportion
+MAX_EXP = 1.0  # of log depth; a larger error has a linear cost
 
 
 class LossConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Weights that bring the parts to one order of size."""
+    """Weights of the parts, which make them comparable."""
 
     depth: float = 4.0
     sky: float = 0.1
@@ -36,7 +36,7 @@ class LossConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     axis: float = 0.6
     front: float = 1.0
     spread: float = 0.54  # of a box: its heat's reach, in sixths of its extent
-    hot: float = 0.2  # from this heat on a cell states the object's body
+    hot: float = 0.2  # min. heat of a cell that predicts the object's body
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Batch:
 
 
 def loss(outputs: tuple[Tensor, ...], batch: Batch, config: LossConfig) -> dict[str, Tensor]:
-    """Each part, weighted; their sum is what to minimise."""
+    """The weighted parts of the loss; minimize their sum."""
     segmentation, log_depth, heat, body = (output.float() for output in outputs)
     cells = _Cells(batch, heat.shape[2], heat.shape[3], config)
     return {
@@ -62,27 +62,26 @@ def loss(outputs: tuple[Tensor, ...], batch: Batch, config: LossConfig) -> dict[
     }
 
 
-def von_mises(axis: Tensor, angle_rad: Tensor, most: float = math.inf) -> Tensor:
-    """(N,) -log likelihood of angles modulo pi by `axis` (N, 2): cos and sin of twice the angle, times a concentration.
+def von_mises(axis: Tensor, angle_rad: Tensor, max_kappa: float = math.inf) -> Tensor:
+    """Negative log likelihood (N,) of angles modulo pi; `axis` (N, 2) is cos and sin of twice the angle, times kappa.
 
-    No certainty beyond the concentration `most` is rewarded. I0 is scaled so that it can't overflow.
+    The concentration kappa is limited to `max_kappa`. I0 is scaled to avoid overflow.
     """
     length = torch.sqrt(axis.square().sum(dim=1) + 1e-6)
-    concentration = length.clamp(max=most)
+    concentration = length.clamp(max=max_kappa)
     along = axis[:, 0] * torch.cos(2.0 * angle_rad) + axis[:, 1] * torch.sin(2.0 * angle_rad)
     return concentration - along * concentration / length + torch.log(torch.special.i0e(concentration))
 
 
 def depth_loss(log_depth: Tensor, batch: Batch, config: LossConfig) -> dict[str, Tensor]:
-    """Of the log of the depth (images, rows, columns), by the names under which the curves show its parts."""
+    """Parts of the loss of log depth (images, rows, columns), by name."""
     weight = torch.where(batch.sky, config.sky, 1.0)
     error = log_depth - batch.log_depth
     total = weight.sum(dim=(1, 2))
     mean = (weight * error).sum(dim=(1, 2), keepdim=True) / total[:, None, None]
-    # On an outline, where either depth may be true, an error of the logarithm favours the more likely depth, an error
-    # relative to the truth the nearer one. The latter's derivative is bounded, so that a pole before the sky does not
-    # outweigh the rest.
-    over = torch.expm1(error.clamp(0.0, _STEEP)) + math.exp(_STEEP) * (error - _STEEP).clamp(min=0.0)
+    # On an outline either depth may be true: a logarithmic error favours the more likely depth, a relative error the
+    # nearer one. The relative error has a bounded derivative, so that a pole in front of the sky does not dominate.
+    over = torch.expm1(error.clamp(0.0, MAX_EXP)) + math.exp(MAX_EXP) * (error - MAX_EXP).clamp(min=0.0)
     missed = over - torch.expm1(error.clamp(max=0.0))
     blame = config.relative * missed + (1.0 - config.relative) * error.abs()
     absolute = (weight * blame).sum(dim=(1, 2)) / total
@@ -95,7 +94,7 @@ def _masks(logits: Tensor, truth: Tensor, config: LossConfig) -> dict[str, Tenso
     for index, (name, weight) in enumerate((("road", config.road), ("lane", config.lane))):
         logit, share = logits[:, index], truth[:, index]
         entropy = functional.binary_cross_entropy_with_logits(logit, share)
-        # Markings are few pixels: their cross entropy is lifted to the road's order of size.
+        # Markings cover few pixels: a factor makes their cross entropy comparable to the road's
         entropy = entropy * (1.0 if name == "road" else 5.0)
         guess = torch.sigmoid(logit)
         common = (guess * share).sum(dim=(1, 2))
@@ -105,7 +104,7 @@ def _masks(logits: Tensor, truth: Tensor, config: LossConfig) -> dict[str, Tenso
 
 
 class _Cells:
-    """What each cell of the grid should say: the heat of each class, and whose body it states with what weight."""
+    """Targets of the grid cells: the heat of each class, the object whose body a cell predicts, and its weight."""
 
     def __init__(self, batch: Batch, rows: int, columns: int, config: LossConfig) -> None:
         objects = batch.objects
@@ -135,11 +134,11 @@ class _Cells:
             [((heat > 0.999) & (classes == index)[..., None, None]).any(dim=1) for index in range(len(CLASSES))], dim=1
         )
         hottest, owner = heat.max(dim=1)
-        # The cells that state a body: (n,) image, row, column, and (n, columns) of its object
+        # The cells that predict a body: (n,) image, row, column, and (n, columns) of its object
         self.b, self.j, self.i = torch.nonzero(hottest > config.hot, as_tuple=True)
         self.owner = objects[self.b, owner[self.b, self.j, self.i]]
         weight = hottest[self.b, self.j, self.i]
-        # An object counts by the log of its extent, whatever the number of its cells
+        # The weight of an object is the log of its extent, independent of its number of cells
         share = torch.zeros(objects.shape[:2])
         share.index_put_((self.b, owner[self.b, self.j, self.i]), weight, accumulate=True)
         self.objects = max(int(taught.sum()), 1)
@@ -197,7 +196,7 @@ def _bodies(body: Tensor, cells: _Cells, config: LossConfig) -> dict[str, Tensor
 
 
 def _giou(a: Tensor, b: Tensor) -> Tensor:
-    """(n,) generalised overlap over union of boxes in pairs."""
+    """Generalized IoU (n,) of pairs of boxes."""
     low, high = torch.maximum(a[:, :2], b[:, :2]), torch.minimum(a[:, 2:], b[:, 2:])
     common = (high - low).clamp(min=0.0).prod(dim=1)
     union = (a[:, 2:] - a[:, :2]).prod(dim=1) + (b[:, 2:] - b[:, :2]).prod(dim=1) - common

@@ -1,4 +1,4 @@
-"""Frustum-PointNet: its targets from bodies of the built-in world, its layers, its losses, and its ONNX file."""
+"""Training of Frustum-PointNet: targets from bodies of the built-in world, layers, losses, and ONNX export."""
 
 from __future__ import annotations
 
@@ -28,24 +28,24 @@ POINTS = Points(name="points", count=512, features=("x", "y", "z", "u", "v", "lo
 BODY = Body(output="body")
 VEHICLES = ("car", "van", "truck", "bus")
 INPUT, OUTPUT = POINTS.name, BODY.output
-FAR_M = 300.0  # the sky's depth
-_CONCENTRATION_MAX = 200.0
+FAR_M = 300.0  # depth of the sky
+MAX_CONCENTRATION = 200.0
 
 
 class FrustumConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Which bodies are learned from."""
+    """Selection of bodies for training."""
 
     least_pixels: int = 50
     least_visible: float = 0.4
     most_truncated: float = 0.5
     max_range_m: float = 70.0
-    margin_rel: float = 0.15  # around a box, so that it can be drawn a little wrong
+    margin_rel: float = 0.15  # around a box, for errors of its edges
 
 
 class DepthErrorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How a depth network errs: 1-sigmas as fractions of the depth, and how it smears.
+    """Error model of a depth network: 1-sigmas as fractions of the depth, and blur.
 
-    It is wrong for a whole frame and for a whole body, its relief is flatter than the body's, and it blurs borders.
+    Errors are common to a frame and to a body; the relief of a body is too flat, and borders are blurred.
     """
 
     frame_rel: float = 0.06
@@ -59,25 +59,25 @@ class DepthErrorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class FrustumExample:
-    """One body in one frame: the depth map around its box, and what is true of it."""
+    """One body in one frame: the depth map around its box, and its truth."""
 
-    depth_m: Floats32  # (h, w) of the block; far where there is sky
-    own: Bools  # (h, w) the body's own pixels
+    depth_m: Floats32  # (h, w) of the block; FAR_M for sky
+    own: Bools  # (h, w) pixels of the body
     corner: tuple[int, int]  # row and column of the block in the map
     camera: Camera  # its image is the map
     box_px: Floats  # (4,)
     centre_cam_m: Floats  # (3,) of the body
     size_m: Floats  # (3,) length, width, height
-    alpha_rad: float  # yaw in ego less the bearing of the centre
+    alpha_rad: float  # yaw in ego minus the bearing of the centre
 
 
 def frusta_of(frame: WorldFrame, config: FrustumConfig) -> list[FrustumExample]:
-    """The bodies of a frame that can be learned from."""
-    return [frustum_example(o, frame, config) for o in chosen(frame, config)]
+    """The training examples of a frame."""
+    return [frustum_example(o, frame, config) for o in select_bodies(frame, config)]
 
 
-def chosen(frame: WorldFrame, config: FrustumConfig) -> list[WorldObject]:
-    """The vehicles that show enough of themselves."""
+def select_bodies(frame: WorldFrame, config: FrustumConfig) -> list[WorldObject]:
+    """The vehicles that are sufficiently visible."""
     return [
         o
         for o in frame.objects
@@ -111,8 +111,8 @@ def frustum_example(o: WorldObject, frame: WorldFrame, config: FrustumConfig) ->
     )
 
 
-def erred(example: FrustumExample, config: DepthErrorConfig, rng: np.random.Generator) -> Floats32:
-    """(h, w) the block's depth as a network might have seen it."""
+def add_depth_errors(example: FrustumExample, config: DepthErrorConfig, rng: np.random.Generator) -> Floats32:
+    """The block's depth (h, w) with random errors of a depth network."""
     log_depth = np.log(example.depth_m)
     own = example.own
     middle = np.median(log_depth[own])
@@ -127,14 +127,14 @@ def erred(example: FrustumExample, config: DepthErrorConfig, rng: np.random.Gene
 
 
 def box_of(example: FrustumExample, config: DepthErrorConfig, rng: np.random.Generator) -> Floats:
-    """(4,) the example's box as a detector might have drawn it."""
+    """The example's box (4,) with random errors of a detector."""
     size = np.tile(example.box_px[2:] - example.box_px[:2], 2)
     out: Floats = example.box_px + rng.normal(0.0, config.box_rel, 4) * size
     return out
 
 
 def points_of(example: FrustumExample, depth_m: Floats32, box_px: Floats) -> Floats:
-    """(N, 3) pseudo-lidar of the block's pixels inside a box, in camera."""
+    """Pseudo-lidar points (N, 3) of the block's pixels inside a box, in the camera frame."""
     camera = example.camera
     whole = DepthMap(
         np.broadcast_to(np.float32(1.0), (camera.height_px, camera.width_px)), camera.width_px, camera.height_px
@@ -153,8 +153,9 @@ def points_of(example: FrustumExample, depth_m: Floats32, box_px: Floats) -> Flo
 def training_pair(
     example: FrustumExample, config: DepthErrorConfig, rng: np.random.Generator
 ) -> tuple[Floats32, Floats32] | None:
-    """Features (C, P) and targets (TARGETS,) of an example with drawn errors; None where too little is in the box."""
-    frustum = frustum_of(points_of(example, erred(example, config, rng), box_of(example, config, rng)), POINTS)
+    """Features (C, P) and targets (TARGETS,) of an example with random errors; None with too few points."""
+    depth_m = add_depth_errors(example, config, rng)
+    frustum = frustum_of(points_of(example, depth_m, box_of(example, config, rng)), POINTS)
     if frustum is None:
         return None
     features = frustum.features
@@ -162,20 +163,20 @@ def training_pair(
     c, s = math.cos(frustum.azimuth_rad), math.sin(frustum.azimuth_rad)
     centre = np.array([c * x - s * z, y, s * x + c * z]) - frustum.middle_m
     yaw_rad = example.alpha_rad - math.atan2(x, z) + frustum.azimuth_rad
-    if rng.random() < 0.5:  # the mirror's world is as good
+    if rng.random() < 0.5:  # mirrored
         features, centre, yaw_rad = mirrored(features), centre * [-1.0, 1.0, 1.0], -yaw_rad
     log_size = np.log(example.size_m / BODY.mean_m)
     return features, np.concatenate([centre, log_size, [yaw_rad, 1.0]]).astype(np.float32)
 
 
 def mirrored(features: Floats32) -> Floats32:
-    """The same points, left and right exchanged."""
+    """The points with left and right exchanged."""
     sign = np.array([-1.0 if name in ("x", "u") else 1.0 for name in POINTS.features], np.float32)
     return features * sign[:, None]
 
 
 class PointNet(nn.Module):
-    """(N, C, P) -> (N, 12), see `perception.pointnet.Body`: each point alone, then what all have in common."""
+    """(N, C, P) -> (N, 12), see `perception.pointnet_manifest.Body`: layers per point, maximum, layers per body."""
 
     def __init__(self, point_widths: Sequence[int] = (48, 96, 160), body_widths: Sequence[int] = (128, 64)) -> None:
         super().__init__()
@@ -184,7 +185,7 @@ class PointNet(nn.Module):
         self.head = nn.Linear(body_widths[-1], 12)
 
     def forward(self, points: Tensor) -> Tensor:
-        """What is known of each body."""
+        """The outputs for each body."""
         count = points.shape[2]
         of_each = self.points(points.transpose(1, 2).flatten(0, 1)).unflatten(0, (-1, count))
         depth = points[:, POINTS.features.index("log_depth"), 0:1]
@@ -202,14 +203,14 @@ def _layers(channels: int, widths: Sequence[int]) -> nn.Sequential:
 
 
 def _folded(layers: nn.Sequential) -> nn.Sequential:
-    """The same layers with the normalisation in the weights."""
+    """The layers with batch normalization folded into the weights."""
     parts = list(layers)
     folded = (fuse_linear_bn_eval(parts[i], parts[i + 1]) for i in range(0, len(parts), 3))
     return nn.Sequential(*(module for linear in folded for module in (linear, nn.ReLU())))
 
 
 def loss(out: Tensor, target: Tensor) -> dict[str, Tensor]:
-    """Each part; their sum is what to minimise."""
+    """The parts of the loss; minimize their sum."""
     out = out.float()
     off = out[:, :3] - target[:, :3]
     log_b = out[:, 3].clamp(-3.0, 3.0)
@@ -222,7 +223,7 @@ def loss(out: Tensor, target: Tensor) -> dict[str, Tensor]:
         "depth": (off[:, 2].abs() * torch.exp(-log_b) + log_b).mean(),
         "across": 2.0 * functional.smooth_l1_loss(out[:, :2], target[:, :2], beta=0.1),
         "size": 0.5 * (size * torch.exp(-log_b_size) + 3.0 * log_b_size).mean(),
-        "axis": von_mises(axis, yaw, _CONCENTRATION_MAX).mean(),
+        "axis": von_mises(axis, yaw, MAX_CONCENTRATION).mean(),
         "front": functional.softplus(-logit).mean(),
     }
 
@@ -236,7 +237,7 @@ def to_onnx(network: PointNet) -> bytes:
 
 
 def manifest(parameters: int, sha256: str) -> str:
-    """The text of the manifest of an exported network."""
+    """The manifest of an exported network."""
     features = ", ".join(f'"{name}"' for name in POINTS.features)
     return f"""\
 # Frustum-PointNet of {parameters} parameters. Trained by `make train` on the built-in world alone.

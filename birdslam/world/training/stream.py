@@ -1,7 +1,7 @@
 """An endless stream of training examples from a seed: rendered frames, each used more than once.
 
-At the small size rendering a frame costs more than a step of training on it. So each frame of a pool gives several
-examples, each from a window and with an augmentation of its own; the pool is renewed frame by frame.
+Rendering a small frame takes longer than a training step. So each frame of a pool gives several examples with different
+windows and augmentations; the pool is renewed frame by frame.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from birdslam.world.truth import WorldFrame
 
 Render = Callable[[int, int, int], WorldFrame]  # (seed, width_px, height_px), as `rendered_world.world.sample`
 
-HELD_OUT_SEEDS = 1_000_000  # seeds below are for evaluation; training draws from here on
+HELD_OUT_SEEDS = 1_000_000  # lower seeds are for evaluation, this and higher ones for training
 
 
 class StreamConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How examples come about."""
+    """Parameters of the stream."""
 
     width_px: int = 640
     height_px: int = 192
-    looks: int = 2  # examples of each rendered frame, on the average
+    looks: int = 2  # mean number of examples per rendered frame
     pool_frames: int = 500
     batch: int = 16
     targets: TargetsConfig = TargetsConfig()
@@ -47,7 +47,7 @@ class Examples:
 
 
 def examples(seed: int, config: StreamConfig, render: Render) -> Iterator[Examples]:
-    """Batches without end; the same for the same seed."""
+    """Endless batches, deterministic by seed."""
     rng = np.random.default_rng(seed)
     pool: list[WorldFrame] = []
     owed = 0.0
@@ -69,7 +69,7 @@ def examples(seed: int, config: StreamConfig, render: Render) -> Iterator[Exampl
 
 
 def draw_example(frame: WorldFrame, config: StreamConfig, rng: np.random.Generator) -> Example:
-    """A drawn window of a frame, augmented as a drawn camera would show it."""
+    """A random window of a frame with random augmentation."""
     height_px, width_px = frame.image.shape[:2]
     window = draw_window(width_px, height_px, config.augmentation, rng)
     example = encode(frame, window, config.width_px, config.height_px, config.targets)
@@ -78,7 +78,7 @@ def draw_example(frame: WorldFrame, config: StreamConfig, rng: np.random.Generat
 
 
 def stack(batch: list[Example]) -> Examples:
-    """One array of each kind."""
+    """Stacks examples to one array per field."""
     return Examples(
         np.stack([example.image for example in batch]),
         np.stack([example.masks for example in batch]),

@@ -1,4 +1,4 @@
-"""From a rendered frame with its truth to an example for the multi-task network: a window of it, at its input size."""
+"""Training targets of the multi-task network: an example from a window of a rendered frame, at the input size."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from birdslam.perception.decoding.multitask import CANONICAL_FOCAL_REL, CLASSES,
 from birdslam.world.truth import CLASSES as SURFACES
 from birdslam.world.truth import WorldFrame, WorldObject
 
-MAX_OBJECTS = 24  # of one example; the largest stay
+MAX_OBJECTS = 24  # per example; the largest are kept
 _ROAD, _LANE, _SKY = (SURFACES.index(name) for name in ("road", "lane", "sky"))
 _CLASS_OF = {"car": 0, "van": 0, "truck": 0, "bus": 0, "pedestrian": 1, "cyclist": 1}
 _KIND_OF = {"car": 0, "van": 0, "truck": 1, "bus": 2}
@@ -24,14 +24,14 @@ assert len(KINDS) == 1 + max(_KIND_OF.values())
 
 
 class TargetsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What counts as an object that can be learnt; pixels are the network's."""
+    """Thresholds of objects used for training, in pixels of the network's input."""
 
-    min_visible: float = 0.3  # of its body in the image; less is neither an object nor background
+    min_visible: float = 0.3  # of its body in the image; less visible objects are ignored
     min_height_px: float = 5.0
     min_width_px: float = 3.0
     min_depth_m: float = 1.0
-    lane_share: float = 0.25  # of a cell of the mask that paint covers: the cell is a marking
-    far_m: float = 120.0  # canonical; what is farther, and the sky, is taken to be there
+    lane_share: float = 0.25  # min. share of paint in a mask cell that is a marking
+    far_m: float = 120.0  # max. canonical depth, also that of the sky
 
 
 # The columns of an example's objects; boxes and centres are in pixels of the input.
@@ -44,7 +44,7 @@ COLUMN = {name: i for i, name in enumerate(OBJECT_COLUMNS)}
 
 @dataclass(frozen=True)
 class Window:
-    """The part of a frame that an example shows, in the frame's pixels, and whether it is mirrored."""
+    """The part of a frame in an example, in the frame's pixels, and whether it is mirrored."""
 
     x0_px: int
     y0_px: int
@@ -60,7 +60,7 @@ class Example:
     `image` (H, W, 3) uint8 BGR. `masks` (2, H/2, W/2) float32: the share of each cell that is road (markings
     included); 1 where it is a lane marking. `log_depth` (H/2, W/2) float32: of the canonical depth in metres; `sky`
     (H/2, W/2) bool.
-    `objects` (MAX_OBJECTS, columns) float32, zeros at the end; a row with taught = 0 but a box is to be ignored.
+    `objects` (MAX_OBJECTS, columns) float32, padded with zeros; the loss ignores a row with taught = 0 and a box.
     """
 
     image: NDArray[np.uint8]
@@ -71,7 +71,7 @@ class Example:
 
 
 def encode(frame: WorldFrame, window: Window, width_px: int, height_px: int, config: TargetsConfig) -> Example:
-    """What the network sees of a frame through a window, and what it should say of it."""
+    """The network's input for a window of a frame, and its targets."""
     rows, columns = slice(window.y0_px, window.y1_px), slice(window.x0_px, window.x1_px)
     half = (width_px // 2, height_px // 2)
     shrinks = window.x1_px - window.x0_px > width_px
@@ -83,9 +83,9 @@ def encode(frame: WorldFrame, window: Window, width_px: int, height_px: int, con
     road = (classes == _ROAD).astype(np.float32) + lane
     masks = np.stack([cv2.resize(mask, half, interpolation=cv2.INTER_AREA) for mask in (road, lane)])
     masks[1] = masks[1] >= config.lane_share
-    # Canonical depth: where the point would be under a camera with the canonical focal length
+    # Canonical depth: that for a camera with the canonical focal length
     zoom = (window.x1_px - window.x0_px) * CANONICAL_FOCAL_REL / frame.camera.fx_px
-    # Its inverse is linear on a plane, so that its mean is the plane's at the cell's centre
+    # Inverse depth is linear on a plane, so its mean is the value at the cell's centre
     nearness = cv2.resize(np.float32(1.0) / depth_m, half, interpolation=cv2.INTER_AREA) / zoom
     sky = cv2.resize((classes == _SKY).astype(np.uint8), half, interpolation=cv2.INTER_NEAREST) > 0
     log_depth = -np.log(np.clip(nearness, 1.0 / config.far_m, 2.0)).astype(np.float32)
@@ -107,9 +107,9 @@ def _objects(frame: WorldFrame, window: Window, size: tuple[int, int], zoom: flo
 def _row(
     frame: WorldFrame, body: WorldObject, window: Window, size: tuple[int, int], zoom: float, config: TargetsConfig
 ) -> dict[str, float] | None:
-    """One object as a row; None where nothing of it can be seen."""
+    """One object as a row; None if it is not visible."""
     scale = np.array(size) / [window.x1_px - window.x0_px, window.y1_px - window.y0_px]
-    # A camera's coordinates are those of pixels' centres, a network's those of their edges.
+    # Camera coordinates refer to pixel centres, network coordinates to pixel edges
     corner_px = np.array([window.x0_px, window.y0_px]) - 0.5
     corners = (np.reshape(body.full_box_px, (2, 2)) - corner_px) * scale
     box = np.clip(corners, 0.0, size)

@@ -1,4 +1,4 @@
-"""Steps of training of the multi-task network, its optimiser and its moving average; their state can be stored."""
+"""Training steps of the multi-task network, its optimizer and its moving average, with a state for checkpoints."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from birdslam.world.training.stream import Examples
 
 
 class TrainerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The optimiser's numbers."""
+    """Parameters of the optimizer."""
 
     network: NetworkConfig = NetworkConfig()
     loss: LossConfig = LossConfig()
@@ -28,14 +28,14 @@ class TrainerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     warm_up_steps: int = 200
     rate_end: float = 0.02  # of the stage's learning rate, at its end
     clip: float = 5.0  # norm of the gradient
-    average: float = 0.998  # of the old weights, at each step
+    average: float = 0.998  # weight of the old average at each step
 
 
 class Trainer:
-    """Holds the network in training and its average, which is what is exported."""
+    """Holds the network in training and its moving average, which is exported."""
 
     def __init__(self, config: TrainerConfig, half: bool) -> None:
-        """`half`: compute in bfloat16 where that is safe."""
+        """`half`: use bfloat16 where it is safe."""
         self.config = config
         self.half = half
         self.network = MultiTask(config.network).to(memory_format=torch.channels_last)
@@ -54,9 +54,9 @@ class Trainer:
         rate: float,
         share: Callable[[Sequence[Parameter]], None] | None = None,
     ) -> dict[str, float]:
-        """One step on a batch; `progress` through the stage in [0, 1], `rate` its learning rate. Returns the parts.
+        """One step on a batch; `progress` is in [0, 1], `rate` the stage's learning rate. Returns the loss parts.
 
-        `share` averages the gradients of several trainers that run side by side.
+        `share` averages the gradients of several parallel trainers.
         """
         cosine = 0.5 * (1.0 + math.cos(math.pi * min(progress, 1.0)))
         warm = min(1.0, (step + 1) / self.config.warm_up_steps)
@@ -80,7 +80,7 @@ class Trainer:
         return {name: float(cost.detach()) for name, cost in costs.items()}
 
     def enlarge(self, factor: float) -> None:
-        """For inputs `factor` times as wide: what is as large on the image as before is `factor` times as far away."""
+        """Adapts the depth to inputs `factor` times as wide: an object of the same size in pixels is farther away."""
         shift = math.log(factor)
         with torch.no_grad():
             for network in (self.network, self.average.module):
@@ -88,7 +88,7 @@ class Trainer:
                 network.body[-1].bias[body_slices()["log_depth"]] += shift
 
     def state(self) -> dict[str, Any]:
-        """All that is needed to go on; `load` takes it back."""
+        """The state for `load`."""
         return {
             "network": self.network.state_dict(),
             "average": self.average.state_dict(),
@@ -96,22 +96,21 @@ class Trainer:
         }
 
     def load(self, state: dict[str, Any]) -> None:
-        """Goes on from a state of before."""
+        """Restores a state."""
         self.network.load_state_dict(state["network"])
         self.average.load_state_dict(state["average"])
         self.optimiser.load_state_dict(state["optimiser"])
 
     def begin(self, *states: dict[str, Any]) -> None:
-        """Takes over the weights of others' states, as far as they have them; the optimiser restarts.
+        """Initializes from the mean weights of other states; missing weights keep their values, the optimizer restarts.
 
-        Of several it is the mean of their weights: where runs began with the same weights, noise is what differs at
-        their ends, and the mean has less of it (Wortsman et al. 2022). Raises ValueError where they have weights that
-        this network has no place for, or not the same ones.
+        The mean of runs from common initial weights reduces their noise (Wortsman et al. 2022). Raises ValueError for
+        weights that this network lacks, and for states of different networks.
         """
         for name in ("network", "average"):
             weights = [state[name] for state in states]
             if any(other.keys() != weights[0].keys() for other in weights):
-                raise ValueError("checkpoints of different networks have no mean")
+                raise ValueError("cannot average checkpoints of different networks")
             mean = {key: _mean([other[key] for other in weights]) for key in weights[0]}
             unexpected = getattr(self, name).load_state_dict(mean, strict=False).unexpected_keys
             if unexpected:
@@ -119,7 +118,7 @@ class Trainer:
 
     @torch.no_grad()
     def answer(self, image: Floats32) -> dict[str, Floats32]:
-        """What the average says of images (B, 3, H, W) in [-1, 1], by the names of the outputs."""
+        """Outputs by name of the averaged network for images (B, 3, H, W) in [-1, 1]."""
         self.average.eval()
         with torch.autocast("cpu", torch.bfloat16, enabled=self.half):
             outputs = self.average(torch.from_numpy(image))
@@ -127,17 +126,17 @@ class Trainer:
 
 
 def _mean(tensors: Sequence[Tensor]) -> Tensor:
-    """Of weights; of counters the last."""
+    """The mean of weights; the last value of counters."""
     return torch.stack(list(tensors)).mean(dim=0) if tensors[0].is_floating_point() else tensors[-1]
 
 
 def as_tensors(examples: Examples) -> tuple[Tensor, ...]:
-    """What passes between processes: bytes as they are."""
+    """Examples as tensors, to be sent between processes."""
     arrays = (examples.image, examples.masks, examples.log_depth, examples.sky, examples.objects)
     return tuple(torch.from_numpy(array) for array in arrays)
 
 
 def as_batch(tensors: tuple[Tensor, ...]) -> Batch:
-    """The image as the network takes it."""
+    """A batch with the image normalized for the network."""
     image, masks, log_depth, sky, objects = tensors
     return Batch(image.permute(0, 3, 1, 2).float() / 127.5 - 1.0, masks, log_depth, sky, objects)

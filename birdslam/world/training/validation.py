@@ -1,4 +1,4 @@
-"""Validation of the multi-task network: its figures on held-out worlds, and the thresholds to read it by."""
+"""Validation of the multi-task network: its metrics and best thresholds on held-out worlds."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from birdslam.world.training.stream import HELD_OUT_SEEDS, Render
 Tensors = Mapping[str, Floats32]
 Answer = Callable[[Floats32], Tensors]  # (1, 3, H, W) in [-1, 1] -> the network's outputs by name
 
-LANE_LOGITS = (-1.5, -1.2, -0.9, -0.6, -0.3, 0.0)  # of a marking; the best is shipped
-LOW_SCORE = 0.05  # keeps nearly every box: the threshold is chosen from the figures
-VALIDATION_SEEDS = HELD_OUT_SEEDS // 2  # worlds that fix thresholds and int8's ranges; in neither training nor figures
+LANE_LOGITS = (-1.5, -1.2, -0.9, -0.6, -0.3, 0.0)  # candidate thresholds of markings
+MIN_SCORE = 0.05  # keeps nearly every box, for tuning the threshold
+VALIDATION_SEEDS = HELD_OUT_SEEDS // 2  # worlds for thresholds and int8 ranges, neither in training nor in metrics
 
 
 def validate(
@@ -31,10 +31,10 @@ def validate(
     augmentation: AugmentationConfig,
     rng: np.random.Generator,
 ) -> dict[str, float]:
-    """The figures of a multi-task network at (width, height) on `frames` held-out worlds; see `Grades.figures`.
+    """The metrics of a multi-task network at (width, height) on `frames` held-out worlds; see `Grades.figures`.
 
-    `lane_logit` and `vehicle_score` are the thresholds that find markings and vehicles best on other worlds, with their
-    images augmented: that lowers the network's scores as a real camera does.
+    `lane_logit` and `vehicle_score` are the best thresholds on other worlds with augmented images, which lower the
+    network's scores as real cameras do.
     """
     width_px, height_px = size_px
     size = Input(
@@ -73,4 +73,4 @@ def validate(
 
 def _decoder(size: Input, tensors: Tensors, lane_logit: float) -> MultiTaskDecoder:
     shapes = {name: tensor.shape for name, tensor in tensors.items()}
-    return MultiTaskDecoder(MultiTask(score_threshold=LOW_SCORE, lane_logit=lane_logit), size, shapes)
+    return MultiTaskDecoder(MultiTask(score_threshold=MIN_SCORE, lane_logit=lane_logit), size, shapes)

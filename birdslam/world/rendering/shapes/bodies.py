@@ -16,7 +16,7 @@ from birdslam.world.rendering.shapes.solids import ball, begin, box, corner, lim
 
 STATIONS = 15
 RIBS = 8  # points of half a cross-section
-TRACK = 0.935  # over the tyres' outer sides, of a vehicle's width
+TRACK_RATIO = 0.935  # over the tyres' outer sides, of a vehicle's width
 
 
 @njit(cache=True, nogil=True)
@@ -174,8 +174,8 @@ def vehicle(B, body, P):  # type: ignore[no-untyped-def]
     )  # fmt: skip
     for side in range(2):
         s = 1.0 - 2.0 * side
-        wheel(B, body, m.WHEEL, P[m.X_FRONT_AXLE], s * TRACK * y, s, r, 0.22)
-        wheel(B, body, m.WHEEL, P[m.X_REAR_AXLE], s * TRACK * y, s, r, 0.22)
+        wheel(B, body, m.WHEEL, P[m.X_FRONT_AXLE], s * TRACK_RATIO * y, s, r, 0.22)
+        wheel(B, body, m.WHEEL, P[m.X_REAR_AXLE], s * TRACK_RATIO * y, s, r, 0.22)
         x = P[m.X_COWL] - 0.35
         inner, outer = s * 0.90 * y, s * (y + 0.1)
         z = P[m.BELT] + 0.02

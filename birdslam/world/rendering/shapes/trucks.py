@@ -5,7 +5,7 @@ from __future__ import annotations
 from numba import njit
 
 from birdslam.world.rendering import materials as m
-from birdslam.world.rendering.shapes.bodies import TRACK, loft
+from birdslam.world.rendering.shapes.bodies import TRACK_RATIO, loft
 from birdslam.world.rendering.shapes.solids import box, limb, wheel
 
 
@@ -82,7 +82,7 @@ def truck(B, body, P):  # type: ignore[no-untyped-def]
         box(B, body, m.DARK, skirt0, skirt1, -0.9 * y, 0.9 * y, 0.45, z0 - 0.05)
     for side in range(2):
         s = 1.0 - 2.0 * side
-        wheel(B, body, m.WHEEL, P[m.X_FRONT_AXLE], s * TRACK * y, s, r, 0.3)
+        wheel(B, body, m.WHEEL, P[m.X_FRONT_AXLE], s * TRACK_RATIO * y, s, r, 0.3)
         if P[m.LENGTH] > 12.0:
             wheel(B, body, m.WHEEL, P[m.LOFT_X0] - 0.6, s * y, s, r, 0.5)
         for axle in range(axles):
