@@ -91,7 +91,7 @@ class Street:
         return float(self.yaw_rad[i + 4] - self.yaw_rad[i - 4]) / (8.0 * STEP_M)
 
     def in_crossing(self, s: float, margin_m: float, side: int = 0) -> bool:
-        """Whether s is within a crossing and the margin; `side`: only with a road to the left (1), right (-1), any (0)."""
+        """Whether s is within a crossing and the margin; with a road to `side` (1 left, -1 right, 0 any)."""
         return any(
             abs(s - row[0]) < row[1] + margin_m and (side == 0 or row[2 if side > 0 else 3] > 0.5)
             for row in self.crossings
