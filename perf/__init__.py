@@ -1,4 +1,4 @@
-"""Benchmarks: `python -m perf NAME`, one module each, which prints its figures and can write them as JSON.
+"""Benchmarks: `python -m perf NAME`, one module each, which prints its results and can write them as JSON.
 
-perf/README.md says what each measures and what came of it; `figures` has what they share.
+perf/README.md describes each and its results; `figures` has the common parts.
 """

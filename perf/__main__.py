@@ -12,7 +12,7 @@ from birdslam.runtime.environment import ENVIRONMENT, INTERRUPTED_STATUS, USER_E
 
 
 def benchmark_modules() -> dict[str, str]:
-    """The full name of each module in the folders of the suite, by its own; benchmarks are those with a `label`."""
+    """Module name -> full name of all modules of the suite; benchmarks are those with a `label`."""
     return {
         module.name: f"{perf.__name__}.{folder.name}.{module.name}"
         for folder in pkgutil.iter_modules(perf.__path__)
@@ -22,12 +22,12 @@ def benchmark_modules() -> dict[str, str]:
 
 
 def main(arguments: list[str]) -> int:
-    os.environ.update(ENVIRONMENT)  # before numpy is loaded: computes as the nodes do
-    from birdslam.perf.errors import PerfError  # and what loads numpy only now
+    os.environ.update(ENVIRONMENT)  # before numpy is imported: the same threads and kernels as the nodes
+    from birdslam.perf.errors import PerfError  # after the environment is set
     from birdslam.runtime.cli.errors import USER_ERRORS
 
     names = benchmark_modules()
-    wanted = arguments[:1] if arguments and arguments[0] in names else names  # one that is named needs no other
+    wanted = arguments[:1] if arguments and arguments[0] in names else names  # import only the named benchmark
     modules = []
     for name in wanted:
         try:
@@ -49,7 +49,7 @@ def main(arguments: list[str]) -> int:
     for name, module in benchmarks.items():
         print(f"{name:16} {module.label}")
     if arguments:
-        print(f"perf: there is no benchmark {arguments[0]!r}", file=sys.stderr)
+        print(f"perf: {arguments[0]!r} is not a benchmark; `python -m perf` lists them", file=sys.stderr)
     return USER_ERROR_STATUS if arguments else 0
 
 

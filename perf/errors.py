@@ -1,5 +1,5 @@
-"""What a user of the suite can mend."""
+"""Errors that a user of the suite can fix."""
 
 
 class PerfError(ValueError):
-    """One line on standard error and exit status 2, as `birdslam` has it."""
+    """An error printed as one line on standard error, with exit status 2."""

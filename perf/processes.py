@@ -14,24 +14,24 @@ from birdslam.perf.errors import PerfError
 
 
 def birdslam_command(*arguments: str) -> list[str]:
-    """The command line of `birdslam`, by this interpreter."""
+    """The command line of `birdslam` with this interpreter."""
     return [sys.executable, "-m", "birdslam.runtime.cli.main", *arguments]
 
 
 def run_birdslam(*arguments: str) -> None:
-    """Runs it to its end. Raises PerfError with what it says where it fails."""
+    """Runs `birdslam`. Raises PerfError with its message if it fails."""
     done = subprocess.run(birdslam_command(*arguments), capture_output=True, text=True, check=False)
     if done.returncode:
         raise PerfError(done.stderr.strip())
 
 
 def processes_of(pid: int, names: Collection[str]) -> dict[str, psutil.Process]:
-    """Those of a run by name: "supervisor", which has this pid, each node, and "NODE spare" for its spare."""
+    """The processes of a run by name: "supervisor" with this pid, each node, and "NODE spare" for its spare."""
     found = {"supervisor": psutil.Process(pid)}
     children = []
     with contextlib.suppress(psutil.NoSuchProcess):
         for child in found["supervisor"].children():
-            with contextlib.suppress(psutil.Error):  # it has just ended
+            with contextlib.suppress(psutil.Error):  # the process has ended
                 children.append((child.create_time(), child.pid, child, child.cmdline()))
     for _, _, child, command in sorted(children, key=lambda one: one[:2]):  # a spare is younger than its node
         for name in names:

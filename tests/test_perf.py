@@ -96,7 +96,7 @@ def test_compare_exits_by_its_verdict(tmp_path: Path, capsys: pytest.CaptureFixt
     assert main(["compare", new, old]) == 0
     assert main(["compare", old, str(tmp_path / "absent.json")]) == 2
     assert "absent.json: No such file" in capsys.readouterr().err
-    with pytest.raises(PerfError, match="no figure in common"):
+    with pytest.raises(PerfError, match="no result in common"):
         compare.compare([_report(1.0, 1)], [{}])
 
 

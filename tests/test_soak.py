@@ -74,10 +74,10 @@ def test_the_sigma_of_a_drift_is_what_a_drift_scatters() -> None:
     ("one", "said"),
     [
         (series([100.0 + 0.1 * number for number in range(30)], [30] * 30), "perceive grew by 2.4%"),
-        (series([100.0] * 24, [30] * 12 + [32, 33] * 6), "perceive holds 2 descriptors more"),
+        (series([100.0] * 24, [30] * 12 + [32, 33] * 6), "perceive holds 2 more descriptors"),
         (
             Series([5.0 * k for k in range(24)], [100.0] * 24, [30] * 24, {1, 2}),
-            "perceive was 2 processes, one after the other",
+            "perceive ran as 2 successive processes",
         ),
     ],
 )

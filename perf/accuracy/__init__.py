@@ -1,1 +1,1 @@
-"""How good the method is on roads, drives and networks beyond the evaluations of `birdslam evaluate`."""
+"""Accuracy on further roads, drives and networks, beyond `birdslam evaluate`."""

@@ -1,9 +1,9 @@
-"""How far figures move between processors: the same evaluations under the kernels of other CPUs.
+"""Spread of results between processors: the same evaluations with the kernels of other CPUs.
 
     python -m perf cpus [--data DIR] [--variant NAME ...] [--output DIR]
 
-Libraries choose kernels by the processor; the environment variables in VARIANTS make them choose those of another. The
-command prints the figures of README (ego-motion, places of cars) for each variant, and the spread of each.
+Libraries select kernels by processor; the environment variables in VARIANTS select those of another one. The command
+prints the README's results (ego-motion, positions of cars) for each variant, and their spread.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from birdslam.perf.processes import birdslam_command
 from birdslam.perf.reporting.arguments import add_data, benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
 
-label = "README's figures under the kernels of other processors, and their spread"
+label = "the README's results with the kernels of other processors, and their spread"
 
-# Kernels of OpenBLAS, OpenCV and numpy, and numbers of threads, in place of those of this processor
+# Kernels of OpenBLAS, OpenCV and numpy, and numbers of threads, that replace this processor's
 VARIANTS: dict[str, dict[str, str]] = {
     "native": {},
     "Nehalem": {"OPENBLAS_CORETYPE": "Nehalem"},
@@ -58,11 +58,11 @@ def run(arguments: list[str]) -> None:
             ledger.add(name, ", ".join(f"{key} {value:.4g}" for key, value in found[name].items()), **found[name])
     print(_table(found))
     if missing:
-        print(f"not at hand: {', '.join(missing)} in {options.data}")
+        print(f"missing in {options.data}: {', '.join(missing)}")
 
 
 def _figures(data: Path, folder: Path, environment: Mapping[str, str], demo_alone: bool) -> Iterator[tuple[str, float]]:
-    """README's figures by name, of the odometry without networks and of recorded boxes."""
+    """The README's results by name, for odometry without networks and for recorded boxes."""
     sequences = ["demo"] if demo_alone else ["demo", *(str(data / name) for name in SEQUENCES)]
     _evaluate(environment, "odometry", *sequences, "--output", str(folder / "odometry"))
     for row in json.loads((folder / "odometry" / "report.json").read_bytes()):
@@ -78,7 +78,7 @@ def _figures(data: Path, folder: Path, environment: Mapping[str, str], demo_alon
 
 
 def _evaluate(environment: Mapping[str, str], *arguments: str) -> None:
-    """Runs `birdslam evaluate` to its end. Raises PerfError with its message where it fails."""
+    """Runs `birdslam evaluate`. Raises PerfError with its message if it fails."""
     command = birdslam_command("evaluate", *arguments)
     done = subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ, **environment})
     if done.returncode:
@@ -86,7 +86,7 @@ def _evaluate(environment: Mapping[str, str], *arguments: str) -> None:
 
 
 def _table(found: Mapping[str, Mapping[str, float]]) -> str:
-    """A row for each figure: its least and greatest value over the variants."""
+    """A row for each result: its minimum and maximum over the variants."""
     keys = list(next(iter(found.values())))
     rows = []
     for key in keys:

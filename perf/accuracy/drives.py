@@ -1,4 +1,4 @@
-"""Recorded drives for benchmarks of the odometry: opened with their truth, followed, and compared with it."""
+"""Recorded drives for benchmarks of the odometry: reading, estimation, and comparison with the truth."""
 
 from __future__ import annotations
 
@@ -37,26 +37,26 @@ SEQUENCES = (
     "kitti_odometry/sequences/06",
     "kitti_tracking/training/image_03/0005",
 )
-MIN_IMAGES = 13  # of a start near the end of a sequence, which has no more
-MIN_WAY_M = 2.0  # of a start: a standing car has no scale
-SCALE_LIMIT, SPEED_LIMIT, SPEED_FLOOR_M = 0.05, 0.1, 0.05  # the floor: a true step is known to a few centimetres
+MIN_IMAGES = 13  # of a start near the end of a sequence
+MIN_DISTANCE_M = 2.0  # of a start; the scale of a stationary car is undefined
+SCALE_LIMIT, SPEED_LIMIT, SPEED_FLOOR_M = 0.05, 0.1, 0.05  # the floor is the noise of a true step
 _MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
 
 
 @dataclass(frozen=True)
 class Drive:
-    """The images of one variant of a sequence, and where its camera was, (N, 4, 4) from the first image."""
+    """The images of one variant of a sequence, and the true camera poses (N, 4, 4) relative to the first image."""
 
     camera: Camera
     images: list[Image]
     t_ns: list[int]
     poses: Floats
-    seen: list[tuple[Floats, Bools | None]]  # by networks: boxes (M, 4), the road
+    seen: list[tuple[Floats, Bools | None]]  # results of networks: boxes (M, 4), road mask
 
 
 @dataclass(frozen=True)
 class Task:
-    """One process's work: one variant of one sequence."""
+    """The work of one process: one variant of one sequence."""
 
     uri: str
     name: str
@@ -68,41 +68,41 @@ class Task:
 
 
 def add_drive_options(parser: argparse.ArgumentParser) -> None:
-    """Which drives, and which networks look at them."""
+    """Adds the options for drives and networks."""
     parser.add_argument("sequences", nargs="*", metavar="SEQUENCE", help="kitti:DIR, or a folder of --data")
     add_data(parser)
     add_networks(parser)
 
 
 def networks_of(options: argparse.Namespace) -> Configuration | None:
-    """The configuration whose networks are to run; None: none are."""
+    """The configuration of the networks to run; None: no networks."""
     return with_networks(options.model) if options.networks or options.model else None
 
 
 def with_networks(models: Sequence[str]) -> Configuration:
-    """The default configuration with these networks (ROLE=PATH), each frame awaiting them."""
+    """The default configuration with these networks (ROLE=PATH), which run on every frame."""
     return load(None, {f"models.{m.partition('=')[0]}.path": m.partition("=")[2] for m in models}).as_lossless()
 
 
 def uri_of(sequence: str, data: Path) -> str:
-    """Of a recording's URI, a folder with a rendered `drive.npz`, or a KITTI folder of the data."""
+    """The URI of a recording, of a folder with a rendered `drive.npz`, or of a KITTI folder of the data."""
     rendered = (Path(sequence) / "drive.npz").is_file()
     return sequence if ":" in sequence or rendered else f"kitti:{data / sequence}"
 
 
 def _open(task: Task) -> Recording:
-    """Raises DatasetError."""
+    """Opens the recording. Raises DatasetError."""
     if ":" in task.uri:
         return open_recording(task.uri, stride=task.stride)
     if task.stride != 1:
-        raise DatasetError(f"{task.uri}: a rendered drive is read whole")
+        raise DatasetError(f"{task.uri}: a rendered drive cannot be read in parts")
     recording = DemoRecording(Path(task.uri))
     recording.name = Path(task.uri).resolve().name
     return recording
 
 
 def read(task: Task, edit: Edit | None = None) -> tuple[str, Drive]:
-    """The sequence, its images decoded once, undistorted and grey, and mirrored where that is asked for.
+    """The sequence with its images decoded once, undistorted and grey, mirrored on request.
 
     `edit` takes an image's index, the number of images, and the image.
     """
@@ -132,12 +132,12 @@ def read(task: Task, edit: Edit | None = None) -> tuple[str, Drive]:
 
 
 def mirrored_camera(camera: Camera) -> Camera:
-    """Of images mirrored left to right."""
+    """The camera of images mirrored left to right."""
     return msgspec.structs.replace(camera, cx_px=camera.width_px - 1 - camera.cx_px, roll_rad=-camera.roll_rad)
 
 
 def _looks(configuration: Configuration | None) -> Iterator[Any]:
-    """For each image in order, a function of it that gives the networks' boxes and road."""
+    """Yields a function from an image to the networks' boxes and road, to be called for each image in order."""
     if configuration is None:
         yield from itertools.repeat(lambda frame: (np.zeros((0, 4)), None))
         return
@@ -153,12 +153,12 @@ def _looks(configuration: Configuration | None) -> Iterator[Any]:
 
 
 def cold_start(drive: Drive, over: range) -> dict[str, Any] | None:
-    """The odometry from nothing over some images of a drive; None where the car does not move."""
+    """A cold start of the odometry over some images of a drive; None if the car does not move."""
     return errors(drive, over, *follow(drive, over))
 
 
 def follow(drive: Drive, over: range) -> tuple[Floats, list[Motion]]:
-    """Where the odometry has the camera at each of the images, (N, 4, 4) from the first one, and all its motions."""
+    """The odometry's camera poses (N, 4, 4) relative to the first image, and all its motions."""
     odometry = Odometry(drive.camera)
     poses = {over[0]: np.eye(4)}
     motions: list[Motion] = []
@@ -174,10 +174,10 @@ def follow(drive: Drive, over: range) -> tuple[Floats, list[Motion]]:
 
 
 def errors(drive: Drive, over: range, estimated: Floats, motions: Sequence[Motion]) -> dict[str, Any] | None:
-    """What `follow` gave against the truth; None where the car does not move."""
+    """Errors of the result of `follow`; None if the car does not move."""
     truth = drive.poses[over.start : over.stop]
-    way, true_way = (_way_m(track) for track in (estimated, truth))
-    if true_way[-1] < MIN_WAY_M:
+    way, true_way = (_distance_m(track) for track in (estimated, truth))
+    if true_way[-1] < MIN_DISTANCE_M:
         return None
     turned = inverse(inverse(truth[0]) @ truth) @ estimated
     rotation_deg = np.degrees(Rotation.from_matrix(turned[:, :3, :3]).magnitude())
@@ -194,7 +194,7 @@ def errors(drive: Drive, over: range, estimated: Floats, motions: Sequence[Motio
     }
 
 
-def _way_m(poses: Floats) -> Floats:
+def _distance_m(poses: Floats) -> Floats:
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(steps)])
 
@@ -204,7 +204,7 @@ def is_valid(motion: Motion) -> bool:
 
 
 def is_wrong(motion: Motion, poses: Floats) -> bool:
-    """Whether its length is off by more than SPEED_LIMIT, and by more than the truth's own noise."""
+    """Whether its length is wrong by more than SPEED_LIMIT and by more than the noise of the truth."""
     true_m = float(np.linalg.norm(poses[motion.to_frame, :3, 3] - poses[motion.from_frame, :3, 3]))
     off_m = abs(float(np.linalg.norm(motion.t_prev_curr_m)) - true_m)
     return off_m > max(SPEED_LIMIT * true_m, SPEED_FLOOR_M)

@@ -1,11 +1,11 @@
-"""One film at other sizes, rates and compressions, with things in the way, begun later: does it give the same metres?
+"""Consistency of the scale of one video at other sizes, rates, compressions, with obstructions, and later starts.
 
     python -m perf films [FILM ...] [--part PART ...] [--seconds S] [--begin-at S ...] [--output DIR] [--data DIR]
                          [--networks] [--model ROLE=PATH ...]
-    python -m perf films FILM --run DIR     # what `birdslam run --output DIR` left of it, by seconds
-    python -m perf films [FILM ...] --calibrate --output DIR     # their camera files again (CAMERAS), nothing else
+    python -m perf films FILM --run DIR     # evaluates the results of `birdslam run --output DIR`
+    python -m perf films [FILM ...] --calibrate --output DIR     # only writes new camera files (CAMERAS)
 
-The odometry alone drives each variant (film_variants.py), all of a film by one camera file, the same each day.
+The odometry processes each variant (film_variants.py) with the same fixed camera file.
 """
 
 from __future__ import annotations
@@ -54,25 +54,25 @@ from birdslam.sources.recording import DatasetError, Recording
 from birdslam.trajectory import as_poses, inverse
 from birdslam.types import NS_PER_S, Frame
 
-label = "one film at other sizes, rates, compressions, and with things in the way: the same metres?"
+label = "consistency of the scale of one video at other sizes, rates, compressions, and with obstructions"
 
 Floats = NDArray[np.float64]
-Seen = tuple[Floats, NDArray[np.bool_] | None]  # boxes (N, 4) and the road (H, W), by networks
-BEGINS_S = {"starts": (0.0, 5.0, 12.0)}  # of the film; of other parts its beginning alone
-SECONDS = 5.0  # of each variant
+Seen = tuple[Floats, NDArray[np.bool_] | None]  # boxes (N, 4) and the road (H, W) from networks
+BEGINS_S = {"starts": (0.0, 5.0, 12.0)}  # start times; other parts start at 0
+SECONDS = 5.0  # duration of each variant
 
 
 @dataclass(frozen=True)
 class Film:
-    """A film at hand: where it is, what its driver knows of the camera, and its truth."""
+    """A video: its source, the known camera parameters, and its truth."""
 
     uri: str  # {data} is the folder of data
     height_m: float | None = None
     fov_deg: float | None = None
     chessboard: str | None = None  # folder of its images
     gps: str | None = None  # file of times and speeds
-    speed_mps: float | None = None  # all the way
-    between_mps: tuple[float, float] | None = None  # all that is known of its speed
+    speed_mps: float | None = None  # constant speed
+    between_mps: tuple[float, float] | None = None  # bounds of its speed
 
     def given(self, data: Path) -> Given:
         board = None if self.chessboard is None else data / self.chessboard
@@ -81,7 +81,7 @@ class Film:
 
 FILMS = {
     "town": Film("video:{data}/dashcam/town.mp4", height_m=1.35, fov_deg=60.0, gps="dashcam/town_gps.csv"),
-    # By the view with which its metres are GPS's: found by that, so that it says nothing of scale, but of the rest
+    # The field of view that matches GPS: not a test of the scale, but of the rest
     "town_72": Film("video:{data}/dashcam/town.mp4", height_m=1.35, fov_deg=72.0, gps="dashcam/town_gps.csv"),
     "motorway": Film(
         "video:{data}/highway/solidWhiteRight.mp4", height_m=1.25, chessboard="highway/camera_cal", speed_mps=25.4
@@ -93,25 +93,25 @@ FILMS = {
     "01": Film("kitti:{data}/kitti_odometry/sequences/01"),
 }
 DEFAULT = ("town", "town_72", "motorway", "00", "0005")
-# A file for each film that has no camera of its own, by `calibrate` of a day that it names: found again, its tilt would
-# differ with each change of the code, and the tables would compare days in place of sizes and rates
+# A camera file for each film without one, written by `--calibrate`. Fixed, so that the tables compare variants and not
+# calibrations
 CAMERAS = Path(__file__).resolve().parents[1] / "film_cameras"
 
 
 def run(arguments: list[str]) -> None:
     parser = benchmark_parser("films", label, output="folder of films.json, films.md and films.png")
     parser.add_argument("films", nargs="*", metavar="FILM", help=f"of {', '.join(FILMS)}")
-    parser.add_argument("--part", action="append", choices=PARTS, help="this one alone; repeatable")
-    parser.add_argument("--begin-at", type=float, nargs="+", metavar="S", help="of the film")
-    parser.add_argument("--seconds", type=float, default=SECONDS, help="of each variant")
-    parser.add_argument("--calibrate", action="store_true", help="find the films' cameras again, into --output")
-    parser.add_argument("--run", type=Path, metavar="DIR", help="compare what `birdslam run` left there of the film")
+    parser.add_argument("--part", action="append", choices=PARTS, help="only this part; repeatable")
+    parser.add_argument("--begin-at", type=float, nargs="+", metavar="S", help="start times in the film")
+    parser.add_argument("--seconds", type=float, default=SECONDS, help="duration of each variant")
+    parser.add_argument("--calibrate", action="store_true", help="calibrate the films' cameras into --output")
+    parser.add_argument("--run", type=Path, metavar="DIR", help="evaluate the results of `birdslam run` in DIR")
     add_data(parser)
     add_networks(parser)
     options = parser.parse_args(arguments)
     unknown = set(options.films) - set(FILMS)
     if unknown:
-        raise PerfError(f"{', '.join(sorted(unknown))}: no such film; there are {', '.join(FILMS)}")
+        raise PerfError(f"{', '.join(sorted(unknown))}: unknown film; expected one of {', '.join(FILMS)}")
     cv2.setNumThreads(1)
     try:
         if options.run is not None:
@@ -119,7 +119,7 @@ def run(arguments: list[str]) -> None:
             return
         if options.calibrate:
             if options.output is None:
-                raise PerfError("--calibrate needs --output: where the camera files go")
+                raise PerfError("--calibrate needs --output, the folder of the camera files")
             calibrate_films(options.films or FILMS, options.data, options.output)
             return
         rows = measure_all(options)
@@ -150,7 +150,7 @@ def measure_all(options: argparse.Namespace) -> list[dict[str, Any]]:
                     for variant in variants(recording.camera, part):
                         course = drive(recording, variant, span_s, true_mps, seen)
                         if not course.t_s or course.t_s[-1] <= BEGINNING_S:
-                            continue  # the film is over before its speed counts
+                            continue  # the film ends before its speed counts
                         figures = summary(course, between_mps)
                         unchanged = unchanged or figures
                         figures["way_over_unchanged"] = over(figures, unchanged)
@@ -163,12 +163,12 @@ def measure_all(options: argparse.Namespace) -> list[dict[str, Any]]:
 
 
 def camera_of(name: str) -> Camera | None:
-    """The camera of a film, the same each day; None of a recording that has its own."""
+    """The fixed camera of a film; None for a recording with a camera file."""
     return None if FILMS[name].height_m is None else load_camera(CAMERAS / f"{name}.toml")
 
 
 def calibrate_films(names: Iterable[str], data: Path, output: Path) -> None:
-    """A camera file for each of the films that has none of its own, as `birdslam run` finds it."""
+    """Writes a camera file for each film without one, calibrated as by `birdslam run`."""
     for name in names:
         film = FILMS[name]
         if film.height_m is None:
@@ -181,11 +181,11 @@ def calibrate_films(names: Iterable[str], data: Path, output: Path) -> None:
 
 
 def text_of_run(folder: Path, films: list[str], data: Path) -> str:
-    """What a run of one film left in its folder, against the film's truth. Raises PerfError, DatasetError."""
+    """Evaluates the results of a run of one film against its truth. Raises PerfError, DatasetError."""
     if len(films) != 1:
         raise PerfError("--run needs the name of its film")
     if not (folder / FRAMES_FILE).is_file():
-        raise PerfError(f"{folder / FRAMES_FILE} is not there: `birdslam run --output DIR` writes it")
+        raise PerfError(f"{folder / FRAMES_FILE} does not exist; `birdslam run --output DIR` writes it")
     film = FILMS[films[0]]
     recording = open_recording(film.uri.format(data=data)) if film.height_m is None else None
     course = course_of_run(folder / FRAMES_FILE, truth(film, recording, data))
@@ -200,7 +200,7 @@ def drive(
     true_mps: TrueSpeed,
     looks: Callable[[int], Seen],
 ) -> Course:
-    """One variant of a film, driven from `span_s`[0] to `span_s`[1], with what networks saw by each time."""
+    """Runs the odometry on a variant of a film from `span_s`[0] to `span_s`[1], with the networks' results by time."""
     camera = variant.camera(recording.camera)
     odometry, undistort = Odometry(camera), Undistorter(camera)
     course, times_ns = Course(), list[int]()
@@ -224,7 +224,7 @@ def drive(
 def looks(
     recording: Recording, span_s: tuple[float, float], configuration: Configuration | None
 ) -> Callable[[int], Seen]:
-    """What the networks see of the unchanged film, by time: that of the newest image."""
+    """The networks' results on the unchanged film as a function of time: those of the newest image."""
     nothing: Seen = (np.zeros((0, 4)), None)
     if configuration is None:
         return lambda t_ns: nothing
@@ -239,7 +239,7 @@ def looks(
 
 
 def _at_size(seen: Seen, given: Camera, camera: Camera) -> Seen:
-    """What was seen in images of the given camera, in those of one of another size."""
+    """Scales the networks' results from the images of one camera to those of another size."""
     boxes_px, road = seen
     width_px, height_px = camera.width_px, camera.height_px
     if (width_px, height_px) == (given.width_px, given.height_px):
@@ -251,7 +251,7 @@ def _at_size(seen: Seen, given: Camera, camera: Camera) -> Seen:
 
 
 def truth(film: Film, recording: Recording | None, data: Path) -> TrueSpeed:
-    """The true speed; only a film without its own truth needs none of the recording's. Raises DatasetError."""
+    """The true speed, from the film or from the recording's poses. Raises DatasetError."""
     if film.speed_mps is not None:
         speed_mps = film.speed_mps
         return lambda begin_s, end_s: speed_mps

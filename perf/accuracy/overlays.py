@@ -1,10 +1,10 @@
-"""Rain drops, dirt and a windscreen's reflection over recorded drives: does the ego-motion go on, is it right?
+"""Ego-motion on recorded drives with rain drops, dirt and reflections on the windscreen.
 
     python -m perf overlays [SEQUENCE ...] [--kinds KIND ...] [--seeds N ...] [--output FILE.json] [--data DIR]
         [--networks] [--model ROLE=PATH ...]
 
 SEQUENCE is kitti:DIR, a folder of --data, or one with a rendered `drive.npz`. Each kind (`windscreen.Overlay`) is drawn
-from the first and from the middle image on. Counts valid frames with a speed off by over a tenth, false standstills.
+from the first and from the middle image on. Counts valid frames with a speed error over 10 % and false standstills.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ NIGHT_IMAGES = 30
 _COUNTS = (
     "frames", "valid", "wrong_valid", "wrong_valid_truth_doubtful", "wrong_over_three", "standstill", "obstructed",
 )  # fmt: skip
-DRIVES_M = 0.1  # in one image, by the truth: such a car does not stand
+MIN_DRIVING_M = 0.1  # true motion per image of a car that is not stationary
 
 
 def run(arguments: list[str]) -> None:
@@ -69,7 +69,7 @@ def run(arguments: list[str]) -> None:
             for sequence in options.sequences or SEQUENCES:
                 task = Task(uri_of(sequence, options.data), "", False, 1, 1, 0, None)
                 for kind, seed, begin in variants(options.kinds, options.seeds):
-                    # The networks see the overlay as well
+                    # The networks also see the overlay
                     edit = edit_of(kind, seed, BEGINS[begin])
                     name, drive = read(replace(task, configuration=configuration), edit)
                     row = measure(drive, BEGINS[begin])
@@ -79,7 +79,7 @@ def run(arguments: list[str]) -> None:
 
 
 def variants(kinds: Sequence[str], seeds: Sequence[int]) -> list[tuple[str, int, str]]:
-    """Kind, seed, and from where on; what does not depend on a seed or a begin is there once."""
+    """Kind, seed and start of each variant, without duplicates."""
     out = []
     for kind in kinds:
         drawn = kind not in ("nothing", "night")
@@ -89,7 +89,7 @@ def variants(kinds: Sequence[str], seeds: Sequence[int]) -> list[tuple[str, int,
 
 
 def edit_of(kind: str, seed: int, share: float) -> windscreen.Edit:
-    """What is drawn over the images after a share of them."""
+    """The edit of the images after a fraction of the sequence."""
     return _night if kind == "night" else windscreen.from_share(kind, seed, share)
 
 
@@ -103,13 +103,13 @@ def _night(index: int, count: int, image: Image) -> Image:
 
 
 def measure(drive: Drive, share: float = 0.5) -> dict[str, Any]:
-    """What the odometry says of the images after a share of them."""
+    """Results of the odometry for the images after a fraction of the sequence."""
     odometry, first = Odometry(drive.camera), int(share * len(drive.images))
     blind_ns, measured_ns = round(PlausibilityConfig().blind_s * NS_PER_S), drive.t_ns[0]
     doubtful = truth_quality.doubtful(drive.poses, np.array(drive.t_ns, np.int64))
     row = dict.fromkeys(_COUNTS, 0)
     way_m = true_m = 0.0
-    ways: dict[int, tuple[float, float, bool]] = {}  # by frame: the way and the true one, and whether it is wrong
+    ways: dict[int, tuple[float, float, bool]] = {}  # by frame: estimated and true distance, and whether it is wrong
     for k, image in enumerate(drive.images):
         motion = odometry.estimate(odometry.track(image), k, drive.t_ns[k], *drive.seen[k])
         if motion is None:
@@ -127,7 +127,7 @@ def measure(drive: Drive, share: float = 0.5) -> dict[str, Any]:
         row["wrong_valid"] += wrong
         row["wrong_valid_truth_doubtful"] += wrong and bool(doubtful[k])
         ways[k] = length_m, step_m, wrong
-        row["standstill"] += motion.standstill and step_m > DRIVES_M * (k - motion.from_frame)
+        row["standstill"] += motion.standstill and step_m > MIN_DRIVING_M * (k - motion.from_frame)
         row["obstructed"] += Status.VIEW_OBSTRUCTED in motion.status
         if motion.from_frame == k - 1:
             way_m, true_m = way_m + length_m, true_m + step_m
@@ -136,10 +136,9 @@ def measure(drive: Drive, share: float = 0.5) -> dict[str, Any]:
 
 
 def _is_wrong_over_three(ways: dict[int, tuple[float, float, bool]], k: int) -> bool:
-    """Whether the way over three images is off by as much as a speed may be: the middle one is frame k, or nearly.
+    """Whether the distance over three images around frame k exceeds the limit of the speed error.
 
-    KITTI's true steps are uneven, since GPS/IMU samples lie up to 10 ms beside the images: of tracking 0005 two of
-    three are 3.5 % too short and the third 5.5 % too long. Over three that is gone.
+    KITTI's true steps are uneven, since GPS/IMU samples are up to 10 ms off the images. Three steps average this.
     """
     about = sorted(ways, key=lambda frame: abs(frame - k))[:3]
     way_m, true_m = (sum(ways[frame][which] for frame in about) for which in (0, 1))
@@ -147,7 +146,7 @@ def _is_wrong_over_three(ways: dict[int, tuple[float, float, bool]], k: int) -> 
 
 
 def row_text(row: dict[str, Any]) -> str:
-    """A row for a person."""
+    """A row as text."""
     scale = "unknown" if row["scale_error"] is None else f"{row['scale_error']:+.1%}"
     return (
         f"{row['frames']:4} frames  valid {row['valid']}, of them wrong {row['wrong_valid']} "

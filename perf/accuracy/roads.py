@@ -1,11 +1,11 @@
-"""Roads of the built-in world that are hard on the ego-motion: bare motorways, ramps, nights; drops, dirt, a bonnet.
+"""Ego-motion on difficult roads of the built-in world: empty motorways, ramps, nights; drops, dirt, a bonnet.
 
     python -m perf roads [NAME ...] [--output DIR] [--keep DIR] [--drives DIR] [--frames N] [--width PX]
 
-A NAME is a road of `world/roads.py` or `demo`, with one of EFFECTS behind a plus (`motorway_30+drops`); default: all,
-and the effects over two of them. Rendered from its seed (extra `train`), or from `--drives`. The odometry runs with the
-true boxes, from each image of `--begin-at` to the end, and cold from every `--every`-th. Writes roads.json, report.md
-and roads.png.
+A NAME is a road of `world/roads.py` or `demo`, optionally with one of EFFECTS after a plus (`motorway_30+drops`);
+default: all, and the effects on two of them. Rendered from its seed (extra `train`), or read from `--drives`. The
+odometry runs with the true boxes, from each image of `--begin-at` to the end, and cold from every `--every`-th. Writes
+roads.json, report.md and roads.png.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from birdslam.trajectory import inverse
 from birdslam.world.compression import VideoEncoder
 from birdslam.world.windscreen import Edit, bonnet, from_middle
 
-label = "hard roads of the built-in world: motorways, ramps, nights, drops, dirt, reflections, bonnets, compression"
+label = "difficult roads of the built-in world: motorways, ramps, nights, drops, dirt, reflections, compression"
 
 DEMO, DEMO_STRIDE, DEMO_FRAMES = "demo", 3, 132
 EFFECTS: dict[str, Callable[[], Edit]] = {
@@ -56,26 +56,26 @@ EFFECTS: dict[str, Callable[[], Edit]] = {
     "bonnet": lambda: lambda index, count, image: bonnet(image),
     "compression": lambda: _compressed(VideoEncoder()),
 }
-SEEN = 0.05  # of a body: whoever is hidden more has no box
+MIN_VISIBLE_RATIO = 0.05  # of a body with a box
 COLUMNS = ("road", "m/s", "Hz", "ways", "rotation", "valid", "of them wrong", "standstill", "NEES", "worst start")
 
 
 def run(arguments: list[str]) -> None:
     parser = benchmark_parser("roads", label, output="folder of roads.json, roads.png and report.md")
-    parser.add_argument("names", nargs="*", metavar="NAME", help="of a road, or ROAD+EFFECT")
-    parser.add_argument("--keep", type=Path, metavar="DIR", help="write each drive that is rendered to DIR/NAME")
-    parser.add_argument("--drives", type=Path, metavar="DIR", help="measure those that lie there; nothing is rendered")
-    parser.add_argument("--frames", type=int, help="of each drive; else all that its road has")
-    parser.add_argument("--width", type=int, default=640, help="of the images in pixels; KITTI's have 1242")
+    parser.add_argument("names", nargs="*", metavar="NAME", help="road, or ROAD+EFFECT")
+    parser.add_argument("--keep", type=Path, metavar="DIR", help="write each rendered drive to DIR/NAME")
+    parser.add_argument("--drives", type=Path, metavar="DIR", help="use the drives in DIR; do not render")
+    parser.add_argument("--frames", type=int, help="frames per drive; default: all")
+    parser.add_argument("--width", type=int, default=640, help="image width in pixels; KITTI has 1242")
     parser.add_argument("--quality", type=int, default=92, help="of the WebP images, 1 to 100")
-    parser.add_argument("--begin-at", type=int, nargs="+", default=[0], metavar="IMAGE", help="followed to the end")
-    parser.add_argument("--every", type=int, default=20, help="images from one cold start to the next")
-    parser.add_argument("--images", type=int, default=25, help="of each cold start")
+    parser.add_argument("--begin-at", type=int, nargs="+", default=[0], metavar="IMAGE", help="starts of full runs")
+    parser.add_argument("--every", type=int, default=20, help="images between cold starts")
+    parser.add_argument("--images", type=int, default=25, help="images per cold start")
     options = parser.parse_args(arguments)
     if options.every < 1 or options.images < MIN_IMAGES or not 1 <= options.quality <= 100:
         raise PerfError(f"--every must be at least 1, --images {MIN_IMAGES}, --quality 1 to 100")
     if min(options.begin_at) < 0:
-        raise PerfError(f"--begin-at {min(options.begin_at)}: images are counted from 0")
+        raise PerfError(f"--begin-at {min(options.begin_at)}: must not be negative")
     if options.frames is not None and options.frames < MIN_IMAGES:
         raise PerfError(f"--frames must be at least {MIN_IMAGES}")
     if not 160 <= options.width <= 4096:
@@ -87,7 +87,7 @@ def run(arguments: list[str]) -> None:
             drives = _Drives(options, Path(spare))
             for name in options.names or drives.names:
                 recording, edit = drives.open(name)
-                drive = read(recording, edit, drives.most(name))
+                drive = read(recording, edit, drives.image_count(name))
                 row = measure(drive, options.begin_at, options.every, options.images)
                 ledger.add(name, row_text(row), hz=recording.rate_hz, **row)
     except DatasetError as error:
@@ -100,14 +100,14 @@ def run(arguments: list[str]) -> None:
 
 
 class _Drives:
-    """The drives by name, rendered where they do not lie on the disk; each once."""
+    """The drives by name; each is rendered once unless it is on disk."""
 
     def __init__(self, options: argparse.Namespace, spare: Path) -> None:
         self._options, self._folder = options, options.drives or options.keep or spare
         self._rendered: set[str] = set()
         if options.drives is None:
             if importlib.util.find_spec("numba") is None:
-                raise PerfError("roads are rendered with numba: install the extra [train], or give --drives")
+                raise PerfError("rendering needs numba; install the extra [train], or name drives with --drives")
             from birdslam.world.roads import ROADS
 
             known = list(ROADS)
@@ -116,15 +116,15 @@ class _Drives:
         over = [name for name in (DEMO, "motorway_30") if name in (DEMO, *known)]
         self.names = [*known, DEMO, *(f"{road}+{effect}" for road in over for effect in EFFECTS)]
 
-    def most(self, name: str) -> int:
-        """How many images are looked at."""
+    def image_count(self, name: str) -> int:
+        """Number of images to use."""
         return self._options.frames or (DEMO_FRAMES if name.partition("+")[0] == DEMO else 10**6)
 
     def open(self, name: str) -> tuple[DemoRecording, Edit | None]:
-        """A drive, and what is drawn over it. Raises PerfError where there is none of the name."""
+        """A drive and the edit of its images. Raises PerfError for an unknown name."""
         road, _, effect = name.partition("+")
         if (name not in self.names and f"{DEMO}+{effect}" not in self.names) or road not in self.names:
-            raise PerfError(f"{name}: there is no such road; there are {', '.join(self.names)}")
+            raise PerfError(f"{name}: unknown road; expected one of {', '.join(self.names)}")
         edit = EFFECTS[effect]() if effect else None
         if road == DEMO:
             return DemoRecording(stride=DEMO_STRIDE), edit
@@ -148,15 +148,15 @@ def _compressed(encoder: VideoEncoder) -> Edit:
     return lambda index, count, image: encoder.code(image)
 
 
-def read(recording: DemoRecording, edit: Edit | None = None, most: int = 10**6) -> Drive:
-    """A drive of the built-in world, grey, with the true boxes of who can be seen; of it at `most` so many images."""
-    count = min(len(recording), most)
+def read(recording: DemoRecording, edit: Edit | None = None, max_images: int = 10**6) -> Drive:
+    """A drive of the built-in world, grey, with the true boxes of visible bodies; at most `max_images` images."""
+    count = min(len(recording), max_images)
     images, t_ns, seen = [], [], []
     for frame in itertools.islice(recording.frames(), count):
         if frame.image is None:
             raise DatasetError(f"{recording.name}: image {frame.index}: {frame.error}")
         image = frame.image if edit is None else edit(frame.index, count, frame.image)
-        boxes = [body.box_px for body in recording.truth_bodies(frame.index) if body.visible > SEEN]
+        boxes = [body.box_px for body in recording.truth_bodies(frame.index) if body.visible > MIN_VISIBLE_RATIO]
         seen.append((np.array(boxes, np.float64).reshape(-1, 4), None))
         images.append(np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8))
         t_ns.append(frame.t_source_ns)
@@ -168,15 +168,15 @@ def read(recording: DemoRecording, edit: Edit | None = None, most: int = 10**6) 
 def measure(
     drive: Drive, begin_at: Sequence[int] = (0,), every: int | None = None, images: int = 25
 ) -> dict[str, Any]:  # fmt: skip
-    """The odometry from some images on to the drive's last; and, with `every`, from each so many-th over some again.
+    """Runs the odometry from some images to the end; with `every`, also cold starts over `images` images.
 
-    Of the ways "scale_errors" has each one's; all else counts them together.
+    "scale_errors" has a value per run; all other results are totals.
     """
     count = len(drive.images)
     ways, motions = [], []
     for first in begin_at:
         if first > count - MIN_IMAGES:
-            raise DatasetError(f"begun at image {first} of {count}: {MIN_IMAGES} are needed")
+            raise DatasetError(f"start at image {first} of {count}: at least {MIN_IMAGES} images are needed")
         estimated, seen = follow(drive, range(first, count))
         way = errors(drive, range(first, count), estimated, seen)
         if way is None:
@@ -213,7 +213,7 @@ def _nees(drive: Drive, motions: Sequence[Motion]) -> float | None:
 
 
 def row_text(row: dict[str, Any]) -> str:
-    """A row for a person."""
+    """A row as text."""
     return "  ".join(f"{name} {cell}" for name, cell in zip(COLUMNS[3:], _cells(row), strict=True))
 
 
@@ -228,12 +228,12 @@ def _cells(row: dict[str, Any]) -> Iterator[str]:
 
 
 def report(rows: Sequence[dict[str, Any]]) -> str:
-    """The table of all roads."""
+    """The report with a table of all roads."""
     lines = [
-        "# Hard roads of the built-in world\n",
-        "Ways and rotation: the errors at the end, from each image that it was begun at, and the worst. Wrong: valid "
-        f"frames with a speed off by more than {SPEED_LIMIT:.0%}. Standstill: frames called so while the car drove. "
-        "NEES: of the motion between images: 1 is consistent. Worst start: the way of the worst cold start; "
+        "# Difficult roads of the built-in world\n",
+        "Ways and rotation: errors of distance and rotation at the end, for each start, and the worst. Wrong: valid "
+        f"frames with a speed error over {SPEED_LIMIT:.0%}. Standstill: frames with this status while the car moved. "
+        "NEES: of the motion between images; 1 is consistent. Worst start: scale error of the worst cold start; "
         f"{SCALE_LIMIT:.0%} is the limit.\n",
         f"| {' | '.join(COLUMNS)} |",
         "|---" * len(COLUMNS) + "|",

@@ -1,4 +1,4 @@
-"""Cold starts of the ego-motion all along recorded drives: errors of scale and rotation over the way since the start.
+"""Cold starts of the ego-motion along recorded drives: errors of scale and rotation over the distance travelled.
 
     python -m perf starts [SEQUENCE ...] [--output DIR] [--data DIR] [--networks] [--model ROLE=PATH ...]
 
@@ -40,7 +40,7 @@ from birdslam.sources.recording import DatasetError
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-label = "cold starts along recorded drives: scale and rotation against the way since the start"
+label = "cold starts along recorded drives: errors of scale and rotation over the distance travelled"
 
 VARIANTS = (("as recorded", False, 1), ("mirrored", True, 1), ("every second image", False, 2))
 _COUNTS = ("n", "over_limit", "wrong_valid", "wrong_valid_truth_doubtful")
@@ -49,8 +49,8 @@ _COUNTS = ("n", "over_limit", "wrong_valid", "wrong_valid_truth_doubtful")
 def run(arguments: list[str]) -> None:
     parser = benchmark_parser("starts", label, output="folder of starts.json and starts.png")
     add_drive_options(parser)
-    parser.add_argument("--every", type=int, default=5, help="images from one start to the next")
-    parser.add_argument("--images", type=int, default=25, help="of each start")
+    parser.add_argument("--every", type=int, default=5, help="images between starts")
+    parser.add_argument("--images", type=int, default=25, help="images per start")
     parser.add_argument("--jobs", type=int, default=2, help="processes")
     options = parser.parse_args(arguments)
     if min(options.every, options.jobs) < 1 or options.images < MIN_IMAGES:
@@ -74,9 +74,9 @@ def run(arguments: list[str]) -> None:
     except (DatasetError, ModelError) as error:
         raise PerfError(str(error)) from error
     print(
-        f"{total['n']} starts, {total['over_limit']} with a scale off by more than {SCALE_LIMIT:.0%}, "
-        f"{total['wrong_valid']} valid frames with a speed off by more than {SPEED_LIMIT:.0%}, of them "
-        f"{total['wrong_valid_truth_doubtful']} where the truth is doubtful"
+        f"{total['n']} starts, {total['over_limit']} with a scale error over {SCALE_LIMIT:.0%}, "
+        f"{total['wrong_valid']} valid frames with a speed error over {SPEED_LIMIT:.0%}, "
+        f"{total['wrong_valid_truth_doubtful']} of them with doubtful truth"
     )
     if options.output is not None:
         draw(rows, options.output / "starts.png")
@@ -94,7 +94,7 @@ def measure(task: Task) -> tuple[str, list[dict[str, Any]]]:
     for first in range(0, count - MIN_IMAGES + 1, task.every):
         start = cold_start(drive, range(first, min(first + task.images, count)))
         if start is not None:
-            # Counted among the wrong ones, and beside them: their truth is no measurement, or of no car
+            # A subset of the wrong ones: their truth is interpolated or implausible for a car
             doubted = [frame for frame in start["wrong_valid"] if doubtful[frame]]
             begins = bool(interpolated[first + 1])
             starts.append(start | {"truth_interpolated": begins, "wrong_valid_truth_doubtful": doubted})
@@ -126,9 +126,9 @@ def summary(starts: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def row_text(figures: dict[str, Any]) -> str:
-    """A row for a person."""
+    """A row as text."""
     if not figures["n"]:
-        return "no start: too short, or the car stands"
+        return "no start: the sequence is too short, or the car is stationary"
     return (
         f"{figures['n']:3} starts  scale median {figures['scale_median']:+.1%} worst {figures['scale_worst']:+.1%} "
         f"(over {SCALE_LIMIT:.0%}: {figures['over_limit']})  rotation median {figures['rotation_median_deg']:.2f} "
@@ -140,7 +140,7 @@ def row_text(figures: dict[str, Any]) -> str:
 
 
 def draw(rows: Sequence[dict[str, Any]], path: Path) -> None:
-    """Each start a line."""
+    """Draws a line per start."""
     figure, grid = plt.subplots(len(rows), 2, figsize=(12, 2.2 * len(rows)), squeeze=False, sharex=True)
     for row, (scale, rotation) in zip(rows, grid, strict=True):
         for start in row["starts"]:
@@ -148,12 +148,12 @@ def draw(rows: Sequence[dict[str, Any]], path: Path) -> None:
             rotation.plot(start["true_way_m"], start["rotation_error_deg"], linewidth=0.8)
         for side in (-1.0, 1.0):
             scale.axhline(side * 100.0 * SCALE_LIMIT, color="k", linestyle=":", linewidth=1)
-        scale.set(ylabel="way, % off", ylim=(-30, 30), title=row["name"])
-        rotation.set(ylabel="rotation, deg off", ylim=(0, 5))
+        scale.set(ylabel="distance error, %", ylim=(-30, 30), title=row["name"])
+        rotation.set(ylabel="rotation error, deg", ylim=(0, 5))
     for axes in grid.ravel():
         axes.grid(True, alpha=0.3)
     for axes in grid[-1]:
-        axes.set_xlabel("true way since the start, m")
+        axes.set_xlabel("true distance since the start, m")
     figure.tight_layout()
     figure.savefig(path, dpi=70)
     plt.close(figure)

@@ -1,1 +1,1 @@
-"""Where time goes: the whole system, its processes, and each part beside its peers."""
+"""Latency of the whole system, its processes, and its parts compared with other libraries."""

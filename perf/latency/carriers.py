@@ -1,8 +1,8 @@
-"""Ways for bytes from one process to another: ours, and its peers; each stamps a message and hands over an array.
+"""Transports between processes, ours and alternatives; each sends a time-stamped array.
 
     python -m birdslam.perf.latency.carriers listen|send CARRIER PLACE BYTES RATE_HZ MESSAGES
 
-A latency is from before the first byte is written until the receiver holds a numpy array of them all.
+The latency is the time from before the first byte is written until the receiver has a numpy array of all bytes.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from birdslam.runtime.transport.ring import FrameReader, FrameRing
 from birdslam.runtime.wire import Stage, Trace
 from birdslam.types import FrameRef, MapUpdate
 
-_STAMP = struct.Struct("<qq")  # when it was sent (CLOCK_MONOTONIC ns), and which it is
+_STAMP = struct.Struct("<qq")  # time sent (CLOCK_MONOTONIC ns), sequence number
 _LENGTH = struct.Struct("<I")
 _VEHICLE = "perf"
 _EMPTY_BYTES, _POINT_BYTES = 40, 19  # of a MapUpdate as MessagePack
@@ -49,12 +49,12 @@ class Sender(Protocol):
 
 
 def _shape(size: int) -> tuple[int, int, int]:
-    """(height, width, channels) of an image of so many bytes: a camera's where it is as large."""
+    """(height, width, channels) of an image of this many bytes, a real camera's if possible."""
     return (size // (3 * 1242), 1242, 3) if size > 1_000_000 else (size // 100, 100, 1)
 
 
 class _RingListener:
-    """The pixels in shared memory, a FrameRef over zenoh: what capture and perceive do (runtime/transport)."""
+    """Pixels in shared memory, a FrameRef over zenoh, as capture and perceive do (runtime/transport)."""
 
     def __init__(self, place: Path, size: int, arrived: Arrived) -> None:
         self._bus = Bus(_VEHICLE, "supervisor", hub=True, runtime_dir=place)
@@ -107,7 +107,7 @@ class _RingSender:
 
 
 class _BusListener:
-    """A typed record over the bus, checked at both ends: what small messages of ours do."""
+    """A typed record over the bus, validated at both ends, as for all small messages."""
 
     def __init__(self, place: Path, size: int, arrived: Arrived) -> None:
         self._bus = Bus(_VEHICLE, "supervisor", hub=True, runtime_dir=place)
@@ -147,14 +147,14 @@ def _next(receive: Callable[[], Message | None]) -> Message | None:
 
 def _require(ready: bool) -> None:
     if not ready:
-        raise TimeoutError(f"nobody listened within {_MATCH_S:g} s")
+        raise TimeoutError(f"no listener within {_MATCH_S:g} s")
 
 
 # --- peers ---
 
 
 class _ZenohListener:
-    """zenoh over a unix socket, with its shared memory or without."""
+    """zenoh over a unix socket, with or without its shared memory."""
 
     def __init__(self, place: Path, size: int, arrived: Arrived, shm: bool = False) -> None:
         self._session = zenoh.open(_zenoh_config("listen", place, shm))
@@ -270,10 +270,10 @@ def _listen(carrier: str, place: Path, size: int, rate_hz: float, messages: int)
 
     listener = CARRIERS[carrier][0](place, size, arrived)
     print("listening", flush=True)
-    sys.stdin.readline()  # the first message is about to come
+    sys.stdin.readline()  # start of the messages
     before_s = time.process_time()
-    sys.stdin.readline()  # the last one has gone
-    last.wait(_LATE_S)  # a dropped one never comes
+    sys.stdin.readline()  # end of the messages
+    last.wait(_LATE_S)  # the last one may be dropped
     cpu_s = time.process_time() - before_s
     listener.close()
     return {"arrivals": arrivals, "cpu_s": cpu_s}
@@ -289,7 +289,7 @@ def _send(carrier: str, place: Path, size: int, rate_hz: float, messages: int) -
         sender.send(number)
     took_s, cpu_s = time.monotonic() - begun_s, time.process_time() - before_s
     print("sent", flush=True)
-    sys.stdin.readline()  # the listener has what it will get
+    sys.stdin.readline()  # the listener has finished
     sender.close()
     return {"took_s": took_s, "cpu_s": cpu_s}
 

@@ -1,10 +1,8 @@
-"""The optimize process with a chosen number of vehicles in sight: `python -m perf system --vehicles 0,5,10,15`.
+"""The optimize process with a given number of visible vehicles: `python -m perf system --vehicles 0,5,10,15`.
 
-The shipped drive has few vehicles, and rendering another one needs the extra [train]. So what perceive would publish in
-a seeded world with so many vehicles (birdslam/bench/simulation/drive.py, the log of the `optimizer` benchmark) goes
-over the real bus at the rate, to the very process that `birdslam run` starts, with its configuration: announced frames,
-checkpoints, map, checks of the wire. This process stands for capture, perceive and the planner. The networks' time does
-not depend on who is in the image.
+Simulated measurements (birdslam/bench/simulation/drive.py) go over the real bus at the rate to the process that
+`birdslam run` starts. This process replaces capture, perceive and the planner; the networks' time does not depend on
+the number of vehicles.
 """
 
 from __future__ import annotations
@@ -44,7 +42,7 @@ _SEED = 1
 def measure(
     vehicles: int, rate_hz: float, seconds: float, warm_up_s: float, settings: tuple[str, ...]
 ) -> dict[str, Any]:
-    """One row: the step of the process, the hops to and from it, and what it costs."""
+    """One row: time of the process's step, the hops to and from it, CPU and memory."""
     frames = round(rate_hz * (seconds + warm_up_s))
     world = drive(DriveConfig(frames=frames, rate_hz=rate_hz, vehicles=vehicles, traffic="convoy"), _SEED)
     with tempfile.TemporaryDirectory(prefix="perf") as folder:
@@ -89,7 +87,7 @@ def _row(
     cpu_cores = (_cpu_s(process) - before_s) / (time.monotonic() - begun_s)
     split: dict[str, list[float]] = {}
     for message in messages:
-        for name, ms in list(stages(message.trace, message.t_received_ns))[3:]:  # from perceive's hop on
+        for name, ms in list(stages(message.trace, message.t_received_ns))[3:]:  # from the hop of perceive
             split.setdefault(name, []).append(ms)
     step_ms = np.array(split["optimize"])
     return {
@@ -113,7 +111,7 @@ def _cpu_s(process: psutil.Process) -> float:
 
 
 def _played(bus: Bus, log: list[Measurements], rate_hz: float) -> Iterator[Message | None]:
-    """The estimate of each frame as it comes; None where none came before the next frame was due."""
+    """The estimate of each frame; None if it did not arrive before the next frame."""
     estimates = bus.subscriber("estimate")
     frames, measurements = bus.publisher("frame"), bus.publisher("measurements")
     if bus.wait_alive({"optimize"}, _READY_S) or not measurements.wait_matched(_READY_S):
@@ -140,7 +138,7 @@ def _answer(estimates: Subscriber, frame_id: int, until_ns: int) -> Message | No
 
 
 def summary(row: dict[str, Any]) -> str:
-    """For a person."""
+    """A row as text."""
     step = row["step_ms"]
     times = "  ".join(f"{name} {step[name]:.2f}" for name in ("p50", "p99", "max"))
     lost = f"dropped {row['dropped']} of {row['frames']}"

@@ -1,10 +1,10 @@
-"""The incremental optimizer against the batch on one sequence of measurements: time, and accuracy on the same edges.
+"""The incremental optimizer compared with the batch solver on one sequence: time, and accuracy on the same edges.
 
     python -m perf incremental [--frames 50,100,200,414] [--vehicles 3] [--seeds 8] [--output F.json]
 
-Time (the paper: 0.016 s against 1.9 s for 414 frames): all updates together against one batch solve, and one update
-against one batch solve. Accuracy of each pose, RMS over seeds and frames, no alignment: live; by gtsam's batch of
-the same edges; by it `--lag` frames later; by the batch of the whole sequence. perf/README.md says how it is read.
+Time (the paper: 0.016 s versus 1.9 s for 414 frames): all updates versus one batch solve, and one update versus one
+batch solve. Accuracy of each pose, RMS over seeds and frames, no alignment: live; gtsam's batch of the same edges; the
+batch `--lag` frames later; the batch of the whole sequence. perf/README.md discusses the results.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ def run(arguments: list[str]) -> None:
     parser = benchmark_parser("incremental", label)
     parser.add_argument("--frames", default="50,100,200,414", help="a list")
     parser.add_argument("--vehicles", type=int, default=3)
-    parser.add_argument("--seed", type=int, default=0, help="of the drive that is timed")
-    parser.add_argument("--seeds", type=int, default=8, help="drives over which accuracy is taken; 0: time alone")
+    parser.add_argument("--seed", type=int, default=0, help="of the timed drive")
+    parser.add_argument("--seeds", type=int, default=8, help="number of drives for accuracy; 0: only time")
     parser.add_argument("--lag", type=int, default=10, help="frames")
     options = parser.parse_args(arguments)
     print(f"{'':44} {'frames':>6} {'sequence':>10} {'ratio':>8} {'newest pose':>12} {'ratio':>8}  iterations")
@@ -69,7 +69,7 @@ def run(arguments: list[str]) -> None:
 
 
 def time_rows(log: Sequence[Measurements]) -> list[dict[str, Any]]:
-    """Every method's time for the whole log and for the newest pose, and how many times the live graph's that is."""
+    """Time of each method for the whole log and for the newest pose, and its ratio to the live graph's."""
     live = {"incremental": ours(SlamConfig()), "incremental, paper mode": PAPER}
     batches = {"batch SE(3), metric odometry": nair.CONFIG, "batch SE(3), unscaled odometry, lanes": batch_se3.CONFIG}
     took: dict[str, tuple[float, float]] = {}
@@ -122,7 +122,7 @@ def _seconds(work: Callable[[], object]) -> float:
 
 
 def accuracy_rows(config: DriveConfig, seeds: int, lag: int) -> list[dict[str, Any]]:
-    """ATE of the ego and of all vehicles by who says it, and how many times that of the batch of the same edges."""
+    """ATE of the ego and of all vehicles per method, and its ratio to that of the batch of the same edges."""
     errors: dict[str, dict[str, list[float]]] = {who: {"ego": [], "vehicle": []} for who in WHO}
     for seed in range(seeds):
         for who, body, error_m in _errors(drive(config, seed), lag):
@@ -142,7 +142,7 @@ def accuracy_rows(config: DriveConfig, seeds: int, lag: int) -> list[dict[str, A
 
 
 def _errors(world: Drive, lag: int) -> list[tuple[str, str, float]]:
-    """(who, body, metres) at the sampled frames; all that `WHO` names know of the same poses."""
+    """(method, body, error in metres) at the sampled frames, for all methods in `WHO`."""
     log, out = world.measurements, []
     graph = PoseGraph(*EQ_6)
     live = [graph.optimise(m) for m in log]

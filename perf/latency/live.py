@@ -1,4 +1,4 @@
-"""The product as it runs: `birdslam run` with its real processes, and this process as its planner."""
+"""Runs `birdslam run` with its real processes; this process is the planner."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ from birdslam.runtime.transport.bus import Message
 from birdslam.sources.recording import Recording
 from birdslam.types import Status
 
-START_S, END_S = 90.0, 120.0  # the shipped drive is graded and filmed at its end
+START_S, END_S = 90.0, 120.0  # max. times of start and end; at the end results are written
 _SAMPLE_S = 1.0
 _PSS_EVERY = 8  # samples
 _VEHICLE = "perf"
 
 
 class Ask(msgspec.Struct, frozen=True, kw_only=True):
-    """What to run; the rest is the product's configuration."""
+    """What to run; all other settings are the defaults."""
 
     source: str
     rate: float
@@ -45,8 +45,8 @@ class Ask(msgspec.Struct, frozen=True, kw_only=True):
     settings: tuple[str, ...] = ()  # KEY=VALUE
     config: str = ""  # a file
     loop: bool = True
-    planners: int = 0  # further ones
-    profile: Path | None = None  # a folder for py-spy's traces
+    planners: int = 0  # number of additional planners
+    profile: Path | None = None  # folder for py-spy's traces
 
     def command(self, place: Path) -> list[str]:
         """The command line of `birdslam`, with all its files under `place`."""
@@ -65,7 +65,7 @@ class Ask(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def once(options: argparse.Namespace, source: str, recording: Recording, rate: float) -> Ask:
-    """A recording once at a rate, with the models and settings of a command line (`add_run_options`)."""
+    """A recording played once at a rate, with the models and settings of a command line (`add_run_options`)."""
     models, settings = tuple(options.model), tuple(options.set)
     seconds = len(recording) / rate
     return Ask(
@@ -75,27 +75,27 @@ def once(options: argparse.Namespace, source: str, recording: Recording, rate: f
 
 @dataclass
 class Sample:
-    """Of the processes, once a second."""
+    """CPU time and memory of the processes at one time."""
 
     t_s: float
     cpu_s: dict[str, float]  # process -> processor time so far
     rss_mb: dict[str, float]
-    pss_mb: dict[str, float] = field(default_factory=dict)  # pages shared with others by their part; now and then
+    pss_mb: dict[str, float] = field(default_factory=dict)  # proportional set size; not in every sample
 
 
 @dataclass
 class Run:
-    """What came out of it."""
+    """The result of a run."""
 
     messages: list[Message] = field(default_factory=list)
     samples: list[Sample] = field(default_factory=list)
     summary: dict[str, Any] = field(default_factory=dict)
     place: Path = Path()
     complete: bool = False  # not cut short by Ctrl-C
-    rate_hz: float | None = None  # that was asked for
+    rate_hz: float | None = None  # requested rate
 
     def after(self, warm_up_s: float) -> Self:
-        """Without its first seconds, in which caches fill and the spares load."""
+        """The run without its first seconds, in which caches fill and spares load."""
         first_ns = self.messages[0].t_received_ns if self.messages else 0
         begun_s = first_ns / 1e9 + warm_up_s
         self.messages = [m for m in self.messages if m.t_received_ns / 1e9 >= begun_s]
@@ -105,9 +105,9 @@ class Run:
 
 @contextlib.contextmanager
 def drive(ask: Ask) -> Iterator[Run]:
-    """Runs it to its end; on Ctrl-C ends it in order, and what was received until then is in the result.
+    """Runs to the end; Ctrl-C shuts down in order and keeps what was received.
 
-    The files of the run live as long as the context. Raises PerfError with the product's own words where it fails.
+    The run's files exist as long as the context. Raises PerfError with the message of `birdslam run` if it fails.
     """
     with tempfile.TemporaryDirectory(prefix="perf") as folder:
         run = Run(place=Path(folder), rate_hz=ask.rate)
@@ -132,7 +132,7 @@ def drive(ask: Ask) -> Iterator[Run]:
 
 
 def _receive(run: Run, process: subprocess.Popen[bytes]) -> bool:
-    """Every estimate; true at the end of the source, false where the process ended before it."""
+    """Receives all estimates; returns whether the source ended before the process did."""
     sample_s, until_s = 0.0, time.monotonic() + START_S
     with Planner(_VEHICLE, run.place / "rt") as planner:
         while process.poll() is None and (run.messages or time.monotonic() < until_s):
@@ -149,7 +149,7 @@ def _receive(run: Run, process: subprocess.Popen[bytes]) -> bool:
 
 
 def _finish(process: subprocess.Popen[bytes], ended: bool) -> None:
-    """Its results are written when it is gone."""
+    """Waits for the end of the process, which then has written its results."""
     if process.poll() is None and not ended:
         process.terminate()
     with contextlib.suppress(subprocess.TimeoutExpired):
@@ -164,14 +164,14 @@ def _sample(pid: int, now_s: float, with_pss: bool) -> Sample:
                 times = process.cpu_times()
                 sample.cpu_s[name] = times.user + times.system
                 sample.rss_mb[name] = process.memory_info().rss / 2**20
-                if with_pss:  # the kernel walks all pages for it
+                if with_pss:  # slow: the kernel walks all pages
                     sample.pss_mb[name] = process.memory_full_info().pss / 2**20
     return sample
 
 
 @contextlib.contextmanager
 def _planners(count: int, runtime_dir: Path) -> Iterator[None]:
-    """Further planners in processes of their own, which take every estimate."""
+    """Additional planners in separate processes, which receive all estimates."""
     command = birdslam_command("listen", "--vehicle", _VEHICLE, "--runtime-dir", str(runtime_dir))
     others = [
         subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
@@ -187,7 +187,7 @@ def _planners(count: int, runtime_dir: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _profiled(folder: Path | None, process: subprocess.Popen[bytes]) -> Iterator[None]:
-    """py-spy's flame graph of each process, from when it runs to its end: FOLDER/NODE.svg."""
+    """Records py-spy's flame graph of each process from start to end: FOLDER/NODE.svg."""
     if folder is None:
         yield
         return
@@ -213,24 +213,24 @@ def _profiled(folder: Path | None, process: subprocess.Popen[bytes]) -> Iterator
     finally:
         for spy in spies:
             if spy.poll() is None:
-                spy.send_signal(signal.SIGINT)  # it writes what it has
+                spy.send_signal(signal.SIGINT)  # py-spy writes its file
             _, errors = spy.communicate()
             if spy.returncode:
                 print(f"py-spy: {errors.decode(errors='replace').strip()}", file=sys.stderr)
 
 
 def setting_options(settings: Iterable[str]) -> list[str]:
-    """The options of `birdslam run` for KEY=VALUE of any field, a user's key or a constant."""
+    """The options of `birdslam run` for KEY=VALUE of any field, a configuration key or a constant."""
     return [part for text in settings for part in ("--set" if is_key(text.partition("=")[0]) else "--constant", text)]
 
 
 def add_run_options(add: Any, many: bool = False) -> None:
-    """The options of a parser that make an Ask; `add` is its add_argument. `many`: a list of sources."""
+    """Adds the options of an Ask to a parser with its add_argument `add`. `many`: a list of sources."""
     sources = "demo (the default: the shipped drive), kitti:DIR or video:FILE"
     if many:
         add("--source", action="append", default=[], metavar="URI", help=sources)
     else:
         add("--source", default="demo", metavar="URI", help=sources)
-    add("--config", default="", metavar="CONFIG.toml", help="of the product")
+    add("--config", default="", metavar="CONFIG.toml", help="configuration file")
     add("--model", action="append", default=[], metavar="ROLE=PATH")
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="any field of the configuration")

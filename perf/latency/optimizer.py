@@ -1,9 +1,8 @@
-"""The optimizer against gtsam's own: time, memory and exceptions over a long drive.
+"""The optimizer compared with gtsam's smoothers: time, memory and exceptions over a long drive.
 
-Every contender takes the same log of `Measurements` in a fresh process with one BLAS thread, and the same edges of it:
-CC, CV, VV and CP (Eqs. 6 and 7), CP in one frame of four. "ours" is Eq. 8 on just these, "ours_live" the graph as
-configured by default. Timed is one frame from decoded record to poses and covariances in Python (none of
-`BatchFixedLagSmoother`). One that takes longer than `--limit-s` is stopped; one that raises restarts on the next frame.
+Each contender takes the same log in a fresh process with one BLAS thread: CC, CV, VV and CP edges (Eqs. 6 and 7), CP in
+every fourth frame. "ours" is Eq. 8 on these edges, "ours_live" the default graph. Timed is one frame, from the decoded
+record to poses and covariances in Python. A contender stops at `--limit-s`; after an exception it restarts.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ from birdslam.perf.reporting.figures import Ledger, curve, noise, spread
 from birdslam.perf.reporting.machine import Steal
 from birdslam.types import FIRST_PERSON, FollowedPerson, Measurements
 
-label = "the pose graph's update against gtsam's smoothers"
+label = "the pose graph's update compared with gtsam's smoothers"
 
 
 class Contender(Protocol):
@@ -44,16 +43,16 @@ class Contender(Protocol):
     def between(self) -> None: ...
 
 
-WINDOWS = (2, 4, 8, 16)  # lengths of the window, in poses of the ego
-_WARM_UP = 100  # frames before memory is looked at
-_PARTS = 50  # of a drive, for the plot over its frames
+WINDOWS = (2, 4, 8, 16)  # lengths of the window in ego poses
+_WARM_UP = 100  # frames before memory is measured
+_PARTS = 50  # of a drive, for the plot over frames
 _LAG_FRAMES = GraphConfig().ego_nodes
 
 
 def run(arguments: list[str]) -> None:
     parser = benchmark_parser("optimizer", label)
-    parser.add_argument("--vehicles", default="0,1,3,6,10,15", help="in sight, a list")
-    parser.add_argument("--people", type=int, default=0, help="followed beside the vehicles, of `ours` and `ours_live`")
+    parser.add_argument("--vehicles", default="0,1,3,6,10,15", help="list of numbers of visible vehicles")
+    parser.add_argument("--people", type=int, default=0, help="number of tracked people, for `ours` and `ours_live`")
     parser.add_argument("--frames", type=int, default=10_000)
     parser.add_argument("--contenders", default=",".join(name for name in CONTENDERS if " " not in name), help="a list")
     parser.add_argument("--limit-s", type=float, default=60.0, help="time for each contender's frames")
@@ -71,7 +70,7 @@ def run(arguments: list[str]) -> None:
 
 
 def write_log(log: Path, config: DriveConfig, seed: int, people: int = 0) -> None:
-    """What every contender takes."""
+    """Writes the log that all contenders use."""
     crowd = tuple(_walker(k) for k in range(people))
     everything = drive(config, seed).measurements
     with_key_frames = (
@@ -90,7 +89,7 @@ def _walker(number: int) -> FollowedPerson:
 
 
 def summary(row: dict[str, Any]) -> str:
-    """For a person."""
+    """A row as text."""
     times = "  ".join(f"{name} {row[f'{name}_us'] / 1e3:.2f}" for name in ("p50", "p99", "undisturbed_p99", "max"))
     times += f"  CPU {row['cpu_p50_us'] / 1e3:.2f}"
     grown = f"frames {row['frames']}  memory {row['rss_growth_mb']:+.0f} MB  exceptions {row['exceptions']}"
@@ -98,7 +97,7 @@ def summary(row: dict[str, Any]) -> str:
 
 
 def measure(contender: str, vehicles: int, log: Path, limit_s: float) -> dict[str, Any]:
-    """One contender in a process of its own; `log` is what `write_log` left."""
+    """Measures one contender in a separate process with the log of `write_log`."""
     one_thread = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     program = [sys.executable, "-m", "birdslam.perf.latency.optimizer"]
     command = [*program, contender, str(vehicles), str(log), str(limit_s)]
@@ -156,7 +155,7 @@ def _drive_through(contender: str, vehicles: int, log: Path, limit_s: float) -> 
         "p99_us": round(p99, 1),
         "p999_us": round(p999, 1),
         "max_us": round(times_us.max(), 1),
-        # Of all its threads: others' load is not in it, but for what they take of caches
+        # CPU time of all its threads, which the load of other processes affects only through caches
         "cpu_p50_us": round(float(np.median(cpu_us[:frames])), 1),
         "cpu_p99_us": round(float(np.percentile(cpu_us[:frames], 99.0)), 1),
         "first_thousand_p50_us": round(np.median(times_us[:1000]), 1),
@@ -182,7 +181,7 @@ class _Ours:
         self.step = self.graph.optimise
 
     def between(self) -> None:
-        """The node publishes the map beside the estimate; it is not part of the update."""
+        """Takes the map update, which is not part of the timed update."""
         self.graph.map_update()
 
 

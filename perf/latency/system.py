@@ -1,10 +1,10 @@
-"""The whole product at a rate: how old an estimate is at the planner, where that time went, and what it costs.
+"""The whole system at a rate: age of estimates at the planner, its parts, and use of CPU and memory.
 
     python -m perf system --source demo|kitti:DIR --rate 33 --seconds 120 [--model detector=F.onnx] --output F.json
 
-The real processes run (`birdslam run`); this process is their planner. A recording is played in a loop at `--rate`,
-whatever its own. `--vehicles 0,5,10,15` drives the optimize process alone (convoy.py). The first seconds
-are left out of the figures, but not out of the count of dropped frames.
+`birdslam run` starts the real processes; this process is their planner. A recording is played in a loop at `--rate`.
+`--vehicles 0,5,10,15` runs only the optimize process (convoy.py). The results exclude the first seconds, except for
+dropped frames.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ def run(arguments: list[str]) -> int:
     add_run_options(parser.add_argument)
     parser.add_argument("--rate", type=float, default=33.0, help="Hz")
     parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--load", type=int, default=0, help="so many busy cores beside it")
-    parser.add_argument("--vehicles", type=numbers, help="a list: the optimize process alone, with so many in sight")
-    parser.add_argument("--planners", type=int, default=0, help="so many further planners")
-    parser.add_argument("--profile", type=Path, metavar="DIR", help="py-spy's flame graph of each process goes there")
+    parser.add_argument("--load", type=int, default=0, help="number of cores loaded by other processes")
+    parser.add_argument("--vehicles", type=numbers, help="list of vehicle counts; only the optimize process runs")
+    parser.add_argument("--planners", type=int, default=0, help="number of additional planners")
+    parser.add_argument("--profile", type=Path, metavar="DIR", help="folder for py-spy's flame graphs")
     options = parser.parse_args(arguments)
     if options.vehicles is not None:
         _with_vehicles(options)
@@ -79,7 +79,7 @@ def _with_vehicles(options: argparse.Namespace) -> None:
 
 
 def figures(result: Run, warm_up_s: float = 0.0) -> dict[str, Any]:
-    """What `system` says of a run; the means of `stages` add up to the mean of `age_ms`."""
+    """The results of a run; the means of `stages` add up to the mean of `age_ms`."""
     summary, received = result.summary, len(result.messages)
     result.after(warm_up_s)
     age_ms = np.array([age_of(message) for message in result.messages])
@@ -121,20 +121,20 @@ def figures(result: Run, warm_up_s: float = 0.0) -> dict[str, Any]:
 
 
 def _overtaken(status: Sequence[Status]) -> bool:
-    """Whether perceive had no time to look at this frame, and said so in time."""
+    """Whether perceive skipped this frame for lack of time and reported it in time."""
     return Status.COASTING in status and Status.PERCEPTION_LATE not in status
 
 
 def age_of(message: Message) -> float:
-    """From the frame's capture until this planner had the estimate, in ms."""
+    """Time in ms from the frame's capture until this planner has the estimate."""
     return float(message.t_received_ns - message.record.t_capture_ns) / 1e6
 
 
 def parts(message: Message) -> Iterator[tuple[str, float]]:
-    """(name, ms) of what an estimate's age is made of; they add up to it.
+    """(name, ms) of the parts of an estimate's age, which add up to it.
 
-    Measurements that come after their frame was given up correct the newest coasted one: that estimate bears their
-    trace, which began before its own frame was captured.
+    Late measurements of a skipped frame correct the newest coasted one. That estimate has their trace, which started
+    before its own frame was captured.
     """
     first = message.trace.stages[0]
     if first.received_ns < message.record.t_capture_ns:
@@ -145,7 +145,7 @@ def parts(message: Message) -> Iterator[tuple[str, float]]:
 
 
 def split(messages: Sequence[Message]) -> dict[str, Floats]:
-    """Part -> (N,) ms of each message; NaN where its way did not lead there (a coasted frame had no perceive)."""
+    """Part -> ms (N,) of each message; NaN for a part that the message skipped (a coasted frame has no perceive)."""
     out: dict[str, Floats] = {}
     for number, message in enumerate(messages):
         for name, ms in parts(message):
@@ -154,12 +154,12 @@ def split(messages: Sequence[Message]) -> dict[str, Floats]:
 
 
 def gone(values: Floats) -> Floats:
-    """Those of the messages whose way led there."""
+    """The values without those of messages that skipped the part."""
     return values[~np.isnan(values)]
 
 
 def lateness(messages: Sequence[Message], rate_hz: float | None) -> Floats:
-    """(N,) ms from when a frame would have been due, by the one that kept the pace best, to its capture."""
+    """Delay (N,) in ms of each capture relative to the schedule through the earliest frame."""
     if not messages or rate_hz is None:
         return np.zeros(0)
     period_ns = 1e9 / rate_hz
@@ -168,12 +168,12 @@ def lateness(messages: Sequence[Message], rate_hz: float | None) -> Floats:
 
 
 def _mean(values: Floats) -> float:
-    """Over all messages, those without the part counted as none of it: so the parts' means add up."""
+    """Mean over all messages, 0 for those without the part, so that the parts' means add up."""
     return round(float(np.nansum(values)) / values.size, 4) if values.size else 0.0
 
 
 def usage(result: Run) -> tuple[dict[str, list[float]], dict[str, float]]:
-    """Cores in use by each process, second for second, and the most memory that it had (MB)."""
+    """Cores in use by each process per second, and its maximum memory (MB)."""
     cores: dict[str, list[float]] = {}
     most_mb: dict[str, float] = {}
     for before, after in zip(result.samples, result.samples[1:], strict=False):
@@ -195,7 +195,7 @@ def _noise_of_cpu(cpu: dict[str, list[float]]) -> dict[str, list[float]]:
 
 
 def budgets(configured: dict[str, float], age_ms: Floats, parts_ms: dict[str, Floats]) -> Iterator[dict[str, Any]]:
-    """Each budget of the configuration, what it was held against, and whether it was met."""
+    """Each budget of the configuration, the measured value, and whether it is met."""
     limits = msgspec.convert(configured, BudgetsConfig)
     measured = {"end_to_end_ms": age_ms}
     for name, values in parts_ms.items():
@@ -215,16 +215,16 @@ def budgets(configured: dict[str, float], age_ms: Floats, parts_ms: dict[str, Fl
 
 
 def table(content: dict[str, Any]) -> str:
-    """For a person."""
+    """The results as text."""
     cpu = ", ".join(f"{name} {cores:.2f}" for name, cores in content["cpu_cores_by"].items())
     lines = [
         f"{'rate':32}{content['rate_hz']:.2f} Hz",
         f"{'dropped':32}{content['dropped']} of {content['frames']} frames, "
-        f"{content['predicted']} predicted and not looked at, {content['coasted']} coasted",
+        f"{content['predicted']} predicted without perception, {content['coasted']} coasted",
         f"{'cores':32}{content['cpu_cores']:.2f} ({cpu})",
         f"{'memory':32}{content['rss_mb']:.0f} MB, {content['pss_mb'] or 0:.0f} MB with shared pages counted once",
         *(
-            f"  {name:30}{mb:.0f} MB, {content['pss_mb_by'][name]:.0f} with its part of what is shared"
+            f"  {name:30}{mb:.0f} MB, {content['pss_mb_by'][name]:.0f} with its share of shared pages"
             for name, mb in content["rss_mb_by"].items()
         ),
         f"{'steal':32}{content['steal_during_percent']:.2f} %",

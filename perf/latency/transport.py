@@ -1,9 +1,9 @@
-"""Pixels and messages between two processes: our ring and bus beside plain zenoh, zenoh's shared memory and a socket.
+"""Pixels and messages between two processes: our ring and bus, plain zenoh, zenoh's shared memory, and a socket.
 
     python -m perf transport [--seconds 3] [--carriers ring,zenoh] [--output F.json]
 
-Every case has two fresh processes. `ring` is what frames take (pixels in shared memory, verified by their checksum, a
-typed FrameRef over zenoh), `bus` what records take (typed and checked at both ends); the peers move bare bytes.
+Each case has two fresh processes. `ring` is the transport of frames (pixels in shared memory with a checksum, a typed
+FrameRef over zenoh), `bus` that of records (typed and validated at both ends); the alternatives send raw bytes.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from birdslam.perf.reporting.figures import Ledger, curve, noise, spread, spread
 from birdslam.perf.reporting.machine import Steal
 from birdslam.runtime.doctor.costs import busy_cores
 
-label = "pixels and messages across processes, by our ring and by its peers"
+label = "pixels and messages between processes: our ring and bus, and alternatives"
 
 SIZES_B = {200: "200 B", 4_000: "4 kB", 1_397_250: "1.4 MB"}  # the last: a colour frame of KITTI
-BUS_MAX_B = 60_000  # records only: pixels never take the bus
+BUS_MAX_B = 60_000  # pixels never use the bus
 PATIENCE_S = 30.0
 
 
@@ -48,14 +48,14 @@ def run(arguments: list[str]) -> None:
     parser = benchmark_parser("transport", label)
     parser.add_argument("--carriers", default=",".join(CARRIERS), help="a list")
     parser.add_argument("--bytes", type=numbers, default=tuple(SIZES_B), help="a list")
-    parser.add_argument("--rates", type=numbers, default=(33, 200), help="Hz, a list")
-    parser.add_argument("--loads", type=numbers, default=(0, 1), help="busy cores, a list")
-    parser.add_argument("--seconds", type=float, default=3.0, help="of each case")
+    parser.add_argument("--rates", type=numbers, default=(33, 200), help="list of rates in Hz")
+    parser.add_argument("--loads", type=numbers, default=(0, 1), help="list of numbers of loaded cores")
+    parser.add_argument("--seconds", type=float, default=3.0, help="duration of each case")
     options = parser.parse_args(arguments)
     carriers = options.carriers.split(",")
     unknown = sorted(set(carriers) - set(CARRIERS))
     if unknown:
-        parser.error(f"there is no carrier {unknown[0]!r}: {', '.join(CARRIERS)}")
+        parser.error(f"{unknown[0]!r} is not a carrier; expected one of {', '.join(CARRIERS)}")
     with Ledger(options.output, label, seconds=options.seconds) as ledger:
         for load in options.loads:
             with busy_cores(load):
@@ -67,7 +67,7 @@ def run(arguments: list[str]) -> None:
 
 
 def cases(carriers: list[str], sizes: tuple[int, ...], rates: tuple[int, ...], load: int) -> Iterator[Case]:
-    """Peers one after the other, so that what changes on the machine meanwhile meets all of them."""
+    """All cases; carriers alternate, so that changes of the machine's load affect all of them."""
     for size in sizes:
         for rate_hz in rates:
             for carrier in carriers:
@@ -76,7 +76,7 @@ def cases(carriers: list[str], sizes: tuple[int, ...], rates: tuple[int, ...], l
 
 
 def measure(case: Case, seconds: float) -> dict[str, Any]:
-    """One case in two fresh processes."""
+    """Measures one case in two fresh processes."""
     messages = max(1, round(seconds * case.rate_hz))
     steal = Steal()
     with tempfile.TemporaryDirectory(prefix="perf") as place:
@@ -126,7 +126,7 @@ def _expect(process: subprocess.Popen[str], word: str) -> None:
     assert process.stdout is not None
     line = process.stdout.readline().strip()
     if line != word:
-        raise RuntimeError(f"perf.carriers said {line!r} instead of {word!r}: {process.args!r}")
+        raise RuntimeError(f"perf.carriers printed {line!r} instead of {word!r}: {process.args!r}")
 
 
 def _tell(process: subprocess.Popen[str]) -> None:

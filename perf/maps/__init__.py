@@ -1,1 +1,1 @@
-"""Maps that are kept: places found again, poses in a map, loops closed."""
+"""Benchmarks of kept maps: place recognition, localization in a map, loop closure."""

@@ -16,7 +16,7 @@ Seen = tuple[Estimate, NDArray[np.uint8]]
 
 
 def estimated(uri: str) -> Iterator[Seen]:
-    """A recording's frames, undistorted, with their estimates by the whole pipeline."""
+    """The estimates of the whole pipeline for a recording, with the undistorted images."""
     recording = open_recorded(uri)
     with pipeline(load(None, {"source.uri": uri})) as through:
         yield from _with_images(uri, (record for record in through(recording) if isinstance(record, Estimate)))

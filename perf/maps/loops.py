@@ -1,10 +1,10 @@
-"""The same road twice: recall and false loops of places, errors of localisation, what closing a loop brings.
+"""Repeated drives: recall and false loops of place recognition, errors of localization, gain of loop closure.
 
     python -m perf loops [--output FILE.json] [--part recorded|town|loop|alike|gnss|size ...]
 
-`recorded`: two passes of a KITTI street in each other's map, other streets in both. `town`: rendered into --drives,
-driven twice, then otherwise. `loop`, `alike`: corners without images, equal houses. `gnss`: fixes that jump. `size`:
-simulated descriptors.
+`recorded`: two passes of a KITTI street, each in the map of the other, and other streets in both. `town`: rendered into
+--drives, two rounds, then other conditions. `loop`, `alike`: simulated features, and equal houses. `gnss`: fixes that
+jump. `size`: simulated descriptors.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ from birdslam.perf.reporting.arguments import add_data, benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
 from birdslam.runtime.nodes.sources import open_recorded
 
-label = "places found again, poses in a kept map, loops closed; a map's size and look-up time"
+label = "place recognition, localization in a kept map, loop closure; a map's size and look-up time"
 
 PARTS = "recorded", "town", "loop", "alike", "gnss", "size"
-BASE_M = 0.537  # between the cameras of the two passes
+BASELINE_M = 0.537  # between the cameras of the two passes
 OTHERS = ("kitti_odometry/sequences/00", "kitti_odometry/sequences/06", "kitti_tracking/training/image_03/0005")
 
 
@@ -46,9 +46,11 @@ def run(arguments: list[str]) -> None:
     add_data(parser)
     parser.add_argument("--part", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--features", nargs="+", choices=list(FeatureKind), default=[FeatureKind.SIFT])
-    parser.add_argument("--drives", type=Path, default=Path("out/town"), metavar="DIR", help="of the rendered town")
-    parser.add_argument("--way", type=float, default=2000.0, metavar="M", help="of the simulated loop")
-    parser.add_argument("--equal-houses", type=float, default=5000.0, metavar="M", help="of each look-alike street")
+    parser.add_argument(
+        "--drives", type=Path, default=Path("out/town"), metavar="DIR", help="folder of the rendered town"
+    )
+    parser.add_argument("--way", type=float, default=2000.0, metavar="M", help="length of the simulated loop")
+    parser.add_argument("--equal-houses", type=float, default=5000.0, metavar="M", help="their length")
     options = parser.parse_args(arguments)
     cv2.setNumThreads(1)
     with Ledger(options.output, label, features=[str(kind) for kind in options.features], way_m=options.way) as ledger:
@@ -67,7 +69,7 @@ def run(arguments: list[str]) -> None:
 
 
 def recorded(ledger: Ledger, data: Path, kinds: Sequence[FeatureKind]) -> None:
-    """The two passes, and other streets against their maps."""
+    """The two passes, and other streets in their maps."""
 
     def read(name: str) -> tuple[Camera, list[Seen]]:
         uri = f"kitti:{data / name}"
@@ -81,19 +83,19 @@ def recorded(ledger: Ledger, data: Path, kinds: Sequence[FeatureKind]) -> None:
             extract = TimedExtractor(kind)
             kept = encode_map(mapped(camera, frames, extract))
             found = localised(*passes[other], kept, kind)
-            truth = [estimate.T_world_ego @ SE2(0.0, side * BASE_M, 0.0) for estimate, _ in frames]
+            truth = [estimate.T_world_ego @ SE2(0.0, side * BASELINE_M, 0.0) for estimate, _ in frames]
             row = judged(found, truth) | {"MB_a_km": round(len(kept) / 1e3 / max(decode_map(kept).length_m, 1.0), 2)}
             row["features_ms"] = round(float(np.median(extract.took_ms)), 1)
             ledger.add(f"{kind}: {other} in the map of {name}", row_text(row), **row, text=row_text(row))
             for street, (street_camera, drive) in others.items():
                 states = localised(street_camera, drive, kept, kind).poses
-                text = f"{len(states)} of {len(drive)} frames localised: all of them would be false"
+                text = f"{len(states)} of {len(drive)} frames localised, all of them falsely"
                 title = f"{kind}: {street} in the map of {name}"
                 ledger.add(title, text, false=len(states), frames=len(drive), text=text)
 
 
 class TimedExtractor(FeatureExtractor):
-    """Knows how long each image took, in milliseconds of a core."""
+    """Measures the CPU time per image in milliseconds."""
 
     def __init__(self, kind: FeatureKind) -> None:
         super().__init__(kind)
@@ -121,7 +123,7 @@ class Localised:
     """A drive in a kept map, as `birdslam run --map-only` writes it."""
 
     rows: list[Localisation]
-    frames_before: int  # the first that was localised while driving
+    frames_before: int  # first frame that was localised online
 
     @property
     def poses(self) -> list[Localisation]:
@@ -138,7 +140,7 @@ def localised(camera: Camera, frames: Iterable[Seen], kept: bytes, kind: Feature
 
 
 def judged(trajectory: Localised, truth: Sequence[SE2]) -> dict[str, Any]:
-    """The localised frames against where the map's own drive says that they are."""
+    """Errors of the localised frames relative to the map's own drive."""
     found = trajectory.poses
     row: dict[str, Any] = {"frames": len(trajectory.rows), "localised": len(found)}
     row["frames_to_localise"] = trajectory.frames_before

@@ -1,4 +1,4 @@
-"""Streets of corners without images, with exact truth: a loop, equal houses, fixes of GNSS, maps of 100 km."""
+"""Simulated features of streets with exact truth: a loop, equal houses, GNSS fixes, maps of 100 km."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ from birdslam.runtime.maps.drive_earth import write_earth
 from birdslam.types import NS_PER_S, Attitude
 
 LENGTHS_KM = 1, 10, 100
-COMPARED_KM = 10  # up to which other indices are looked at too
+COMPARED_KM = 10  # max. length for the comparison with other indices
 LOOK_UPS = 20
 ORIGIN, FIX_M = (51.05, -114.05), 2.5
-LEG_M, CORNER_M = 400, 19  # of the winding street of equal houses: straight on, and each of two corners of 12 m radius
+LEG_M, CORNER_M = 400, 19  # winding street of equal houses: straight legs, and corners of 12 m radius
 
 
 def loop(ledger: Ledger, way_m: float) -> None:
-    """A loop driven twice, then localised in."""
+    """A loop driven twice, then localization in its map."""
     street = build(block(way_m / 4.0), seed=1)
     around = len(street.route)
     place_map = PlaceMap(MapCamera.of(CAMERA))
@@ -55,7 +55,7 @@ def loop(ledger: Ledger, way_m: float) -> None:
     session.finish()
     open_m = max(_apart(truth[each.t_source_ns], odometry[each.t_source_ns]) for each in place_map.keyframes)
     closed_m = max(_apart(truth[each.t_source_ns], each.T_map_keyframe) for each in place_map.keyframes)
-    # Scale is no loop's to find: the frame is the first drive's, whose metres are off by a share of the way
+    # A loop does not determine the scale: the frame has the scale error of the first drive
     at = np.array([(k.T_map_keyframe.x_m, k.T_map_keyframe.y_m) for k in place_map.keyframes])
     true = np.array([(truth[k.t_source_ns].x_m, truth[k.t_source_ns].y_m) for k in place_map.keyframes])
     scale = float((at * true).sum() / (at**2).sum())
@@ -72,9 +72,9 @@ def loop(ledger: Ledger, way_m: float) -> None:
         "loops": sum(link.loop for link in place_map.links),
     }
     text = (
-        f"end {before_m:.2f} m off by odometry ({before_m / around * 50.0:.2f} % of the way), {end_m:.2f} m in the map "
-        f"({end_m / around * 50.0:.2f} %); worst keyframe {open_m:.2f} m off by odometry, {closed_m:.2f} m in the map, "
-        f"{unscaled_m:.2f} m with its metres times {scale:.4f}"
+        f"end error {before_m:.2f} m by odometry ({before_m / around * 50.0:.2f} %), {end_m:.2f} m in the map "
+        f"({end_m / around * 50.0:.2f} %); worst keyframe {open_m:.2f} m by odometry, {closed_m:.2f} m in the map, "
+        f"{unscaled_m:.2f} m after scaling by {scale:.4f}"
     )
     ledger.add(f"loop of {around} m, twice", text, **row, text=text)
     kept = encode_map(place_map)
@@ -91,7 +91,7 @@ def loop(ledger: Ledger, way_m: float) -> None:
 
 
 def alike(ledger: Ledger, equal_m: float) -> None:
-    """Streets of equal houses: straight on, and winding to and fro, so that a street looks like the one beside it."""
+    """Streets of equal houses: a straight one, and a winding one whose legs look alike."""
     straight = [0.0] * round(equal_m + 70.0)
     for name, turns in (("straight", straight), ("winding", _winding(len(straight)))):
         houses = build(along(turns), seed=3, house_m=20.0)
@@ -106,7 +106,7 @@ def alike(ledger: Ledger, equal_m: float) -> None:
 
 
 def _winding(count: int) -> list[float]:
-    """Turns of a metre each: two corners to the left, two to the right, and so on."""
+    """Turn per metre: alternately two corners to the left and two to the right."""
     out: list[float] = []
     side = 1.0
     while len(out) < count:
@@ -117,7 +117,7 @@ def _winding(count: int) -> list[float]:
 
 
 def gnss(ledger: Ledger, way_m: float) -> None:
-    """A drive with fixes each second; what is left of its way's errors on Earth."""
+    """A drive with a fix per second, and its remaining errors on Earth."""
     street = build(block(way_m / 4.0), seed=1)
     chance = np.random.default_rng(7)
     driven = [(estimate, T) for estimate, _, T in drive(street, range(len(street.route)), seed=5)]
@@ -153,7 +153,7 @@ def gnss(ledger: Ledger, way_m: float) -> None:
         east, north, _ = pymap3d.geodetic2enu(lat, lon, 0.0, *ORIGIN, 0.0)
         worst_m = float(np.hypot(east - true[:, 0], north - true[:, 1]).max())
         text = (
-            f"way of {len(true)} m: worst {begun_m:.2f} m off by odometry, {worst_m:.2f} m with the fixes; "
+            f"{len(true)} m: worst error {begun_m:.2f} m by odometry, {worst_m:.2f} m with the fixes; "
             f"{about['outliers']} of {about['fixes']} outliers, {len(wrong) // every} wrong; {took_s:.1f} s of a core"
         )
         worst = {"worst_by_odometry_m": round(begun_m, 3), "worst_m": round(worst_m, 3)}
@@ -169,7 +169,7 @@ def _apart(a: SE2, b: SE2) -> float:
 
 
 def _again(kept: bytes, street: Street, rows: range, lateral_m: float, bits: float, first: SE2) -> tuple[float, float]:
-    """The share of frames that are localised, and the worst of them against the nearest keyframe's own error."""
+    """The share of localised frames, and their worst error relative to the nearest keyframe."""
     session = _session(decode_map(kept), extend=False)
     frames, errors = 0, [0.0]
     localised_frames = 0
@@ -183,7 +183,7 @@ def _again(kept: bytes, street: Street, rows: range, lateral_m: float, bits: flo
 
 
 def size(ledger: Ledger) -> None:
-    """Descriptors of streets that share some, as those of houses do, in place of drives."""
+    """Size and look-up time with simulated descriptors, some of which streets share."""
     chance = np.random.default_rng(0)
     common = chance.integers(0, 256, (4000, DESCRIPTOR_BYTES), dtype=np.uint8)
     for length_km in LENGTHS_KM:

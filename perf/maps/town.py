@@ -1,4 +1,4 @@
-"""A rendered block of a town: driven twice, and then otherwise, in the map of that (see world/town.py)."""
+"""A rendered town loop: two rounds for the map, then drives in other conditions (see world/town.py)."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ from birdslam.trajectory import inverse, mount_pose, split_pose
 
 QUALITY = 90  # of the WebP images
 TWICE = "twice"
-BEGIN = "begin.npy"  # beside a drive: T_world_cam of its first image, which makes truths of two drives comparable
-FALSE_M = 2.0  # a loop, or a pose in the map, that is off by more is another place
+BEGIN = "begin.npy"  # T_world_cam of a drive's first image, the common frame of two drives
+FALSE_M = 2.0  # min. error of a false loop or a false pose
 KIDNAPPED = ("traffic", "lane", 150)  # from this image of one drive to the first of the other
 
 
 @dataclass(frozen=True)
 class _Drive:
-    """One that was rendered: its recording, and each frame's true ego in the world."""
+    """A rendered drive: its recording, and the true ego pose of each frame in world."""
 
     recording: DemoRecording
     truth: list[SE2]
@@ -52,7 +52,7 @@ class _Drive:
 
 
 def measure(ledger: Ledger, drives: Path) -> None:
-    """All drives of the town, each rendered where it is not there. Raises PerfError."""
+    """Measures all drives of the town; missing ones are rendered. Raises PerfError."""
     names = render(drives)
     place_map, T_world_map = _twice(ledger, drives / TWICE)
     kept = encode_map(place_map)
@@ -68,11 +68,11 @@ def measure(ledger: Ledger, drives: Path) -> None:
 
 
 def render(folder: Path) -> dict[str, str]:
-    """What there is of each drive, by its name, after rendering those that lack."""
+    """Name -> folder of each drive, after rendering missing ones."""
     if importlib.util.find_spec("numba") is None:
         known = folder / "drives.json"
         if not known.is_file():
-            raise PerfError("the town is rendered with numba: install the extra [train], or give --drives")
+            raise PerfError("rendering needs numba; install the extra [train], or name rendered drives with --drives")
         return msgspec.json.decode(known.read_bytes(), type=dict[str, str])
     from birdslam.world.roads import CAMERA
     from birdslam.world.town import DRIVES, RATE_HZ, frames
@@ -89,7 +89,7 @@ def render(folder: Path) -> dict[str, str]:
 
 
 def _twice(ledger: Ledger, folder: Path) -> tuple[PlaceMap, dict[int, SE2]]:
-    """Two rounds: what closing them brings; the map, and the true place of each of its keyframes by number."""
+    """Two rounds: gain of the loop closure; returns the map and the true pose of each keyframe by number."""
     drive = _Drive.open(folder)
     place_map = PlaceMap(MapCamera.of(drive.recording.camera))
     session = MapSession(drive.recording.camera, place_map, True)
@@ -111,7 +111,7 @@ def _twice(ledger: Ledger, folder: Path) -> tuple[PlaceMap, dict[int, SE2]]:
         localised += second_round and last.state is MapState.LOCALISED
     session.finish()
     if T_map_world is None or last is None:
-        raise PerfError(f"{folder}: odometry never was valid")
+        raise PerfError(f"{folder}: the odometry was never valid")
     way_m = float(np.hypot(*np.diff([(T.x_m, T.y_m) for T in drive.truth], axis=0).T).sum())
     end = T_map_world @ drive.truth[-1]
     T_end = session.localiser.T_map_odom @ odometry[last.t_source_ns] if session.localiser.T_map_odom else None
@@ -127,8 +127,8 @@ def _twice(ledger: Ledger, folder: Path) -> tuple[PlaceMap, dict[int, SE2]]:
     false = sum(_apart(at[e.from_number].between(at[e.to_number]), e.T_from_to) > FALSE_M for e in loops)
     size = len(encode_map(place_map))
     text = (
-        f"way {way_m:.0f} m; end {open_m:.2f} m off by odometry ({100 * open_m / way_m:.2f} %), {closed_m:.2f} m after "
-        f"closing ({100 * closed_m / way_m:.2f} %); worst keyframe {worst_open_m:.2f} m before, {worst_m:.2f} m after; "
+        f"{way_m:.0f} m; end error {open_m:.2f} m by odometry ({100 * open_m / way_m:.2f} %), {closed_m:.2f} m after "
+        f"closure ({100 * closed_m / way_m:.2f} %); worst keyframe {worst_open_m:.2f} m before, {worst_m:.2f} m after; "
         f"{len(loops)} loop links, {false} of them false; second round {localised} of {frames} frames localised; "
         f"{len(place_map)} keyframes, {size / 1e6:.2f} MB"
     )
@@ -182,13 +182,13 @@ def _judged(found: list[Localisation], truth: list[SE2], place_map: PlaceMap, at
 def _kidnapped(
     ledger: Ledger, drives: Path, kept: bytes, place_map: PlaceMap, at: dict[int, SE2], seen: dict[str, list[Seen]]
 ) -> None:
-    """Odometry goes on as if nothing had been, and the car is elsewhere."""
+    """The car jumps to another place while the odometry continues."""
     name, other, cut = KIDNAPPED
     first, then = _Drive.open(drives / name), _Drive.open(drives / other)
     session = MapSession(first.recording.camera, decode_map(kept), False)
     for estimate, image in seen[name][:cut]:
         session.step(estimate, image)
-    # As soon as the other drive's odometry is valid
+    # From the first valid odometry of the other drive
     after = [pair for pair in seen[other] if pair[0].valid]
     T_odom = seen[name][cut - 1][0].T_world_ego @ after[0][0].T_world_ego.inverse()
     wrong_m, recovered_m = 0.0, float("nan")
@@ -207,5 +207,5 @@ def _kidnapped(
                 wrong_m, recovered_m = way_m, float("nan")
             elif not recovered_m <= way_m:
                 recovered_m = way_m
-    text = f"localised again after {recovered_m:.0f} m; said to be where it was for the first {wrong_m:.0f} m of them"
+    text = f"localised again after {recovered_m:.0f} m; false poses for the first {wrong_m:.0f} m of them"
     ledger.add("town: kidnapped", text, text=text, recovered_m=recovered_m, wrong_m=wrong_m)

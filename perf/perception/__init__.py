@@ -1,1 +1,1 @@
-"""Networks and decodings by themselves: what they find, on rendered and on real frames."""
+"""Evaluation of networks on rendered and real frames."""

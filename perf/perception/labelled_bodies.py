@@ -1,7 +1,7 @@
-"""Size and heading of the bodies that a network finds in real images, against labels and beside the class's prior.
+"""Errors of size and heading of a network's bodies in real images, compared with the class prior.
 
-Images of KITTI tracking, 0002 and 0005. A body is that of the label which its box
-overlaps most. Errors of size are a vehicle's means over its sights, since they last for it; so are the prior's.
+Images and labels of KITTI tracking, 0002 and 0005. A body belongs to the label that its box overlaps most. Errors of
+size are means over a vehicle's observations, since they are correlated.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ from birdslam.vehicles.placement.localisation import DIMENSIONS
 from birdslam.world.training.grading import box_ious
 
 SEQUENCES = ("0002", "0005")
-KINDS = {"cars": ("Car",), "cars and vans": ("Car", "Van")}  # a van is a car to the network, and to most detectors
+KINDS = {"cars": ("Car",), "cars and vans": ("Car", "Van")}  # the network labels vans as cars, like most detectors
 VEHICLES = ("car", "truck", "bus")
 RANGES_M = ((0.0, 15.0), (15.0, 30.0), (30.0, 50.0))
 SAME_IOU = 0.5
 MAX_OCCLUDED = 1  # KITTI: partly
-OFF_DEG = 10.0  # a heading that is off by more
+OFF_DEG = 10.0  # min. error of a wrong heading
 PRIOR_M = (DIMENSIONS["car"].length_m, DIMENSIONS["car"].width_m, DIMENSIONS["car"].height_m)
-# A row of `errors`: depth (m), heading off by (rad), 1 where it is cut or hidden, logs of the size said over the true
-# one (length, width, height), of the prior over the true one
+# A row of `errors`: depth (m), heading error (rad), 1 if truncated or occluded, logs of the estimated over the true
+# size (length, width, height), of the prior over the true size
 DEPTH, OFF, CUT, SIZE, PRIOR = 0, 1, 2, slice(3, 6), slice(6, 9)
 
 Look = Callable[[NDArray[np.uint8]], Detections | None]
 
 
 def measure(look: Look, data: Path) -> dict[str, dict[str, float]]:
-    """Figures by kind, whether it is in full view, and range; none where no labelled image is at hand."""
+    """Results by kind, visibility and range; empty without labelled images."""
     rows: list[Floats] = []
     vehicles: list[str] = []
     kinds: list[str] = []
@@ -82,7 +82,7 @@ def _labelled(root: Path, name: str) -> Iterator[tuple[NDArray[np.uint8], list[L
 def errors(
     found: Detections, labels: Sequence[Label], camera: Camera, T_cam0_camera: Transform
 ) -> list[tuple[Label, Floats]]:
-    """A row for each label of a vehicle that a box with a body is of."""
+    """A row for each vehicle label with a matching body."""
     here = [label for label in labels if any(label.kind in kinds for kinds in KINDS.values())]
     if found.boxes3d is None or not len(found.boxes_px) or not here:
         return []
@@ -93,7 +93,7 @@ def errors(
         if shared[i, j] < SAME_IOU or shared[:, j].argmax() != i:
             continue
         place_m = inverse(T_cam0_camera) @ np.append(label.place_m, 1.0)
-        # KITTI's yaw is about down and 0 to the right, ours about up and 0 ahead
+        # KITTI's yaw is about down, 0 to the right; ours about up, 0 ahead
         yaw_rad = math.atan2(-math.cos(label.rotation_y_rad), -math.sin(label.rotation_y_rad))
         alpha_rad = yaw_rad - math.atan2(-place_m[0], place_m[2])
         off_rad = math.remainder(float(bodies.alpha_rad[j]) - alpha_rad, 2.0 * math.pi)
@@ -105,7 +105,7 @@ def errors(
 
 
 def summary(table: Floats, vehicles: NDArray[np.str_]) -> dict[str, float]:
-    """Of rows of `errors`: headings by sight, sizes by vehicle (root mean squares of logs, the prior's beside)."""
+    """Summary of rows of `errors`: headings per observation, sizes per vehicle (RMS of logs, also of the prior)."""
     off_deg = np.degrees(np.abs(table[:, OFF]))
     axis_deg = np.minimum(off_deg, 180.0 - off_deg)
     means = np.array([table[vehicles == vehicle].mean(axis=0) for vehicle in np.unique(vehicles)])

@@ -1,10 +1,10 @@
-"""How good the shipped network is: against the truth of held-out worlds, and on real frames that it never learnt from.
+"""Accuracy of the shipped network on held-out rendered worlds and on real frames.
 
     python -m perf networks [--network F.onnx] [--frames 300] [--data DIR] [--models DIR] [--output F.json]
 
-Held-out worlds need the extra [train]; without it their rows are left out and said to be. Real frames are those of
-BIRDSLAM_DATA: depth against the LiDAR of the raw clip; masks and boxes against two networks of other makers, which
-are no truth but a comparison; sizes and headings of bodies against the labels of KITTI tracking.
+Held-out worlds need the extra [train] and are skipped without it. Real frames come from BIRDSLAM_DATA: depth is
+compared with the LiDAR of the raw clip, masks and boxes with two third-party networks (not ground truth), sizes and
+headings of bodies with the labels of KITTI tracking.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ from birdslam.perf.reporting.figures import Ledger
 from birdslam.sources.opening import open_recording
 from birdslam.world.training.grading import MIN_SIDE_ASPECT, Grades, box_ious, extents, overlap
 
-label = "the shipped network: held-out worlds, and real frames beside LiDAR and two other networks"
+label = "the shipped network on held-out worlds, and on real frames with LiDAR and two other networks"
 
 SIZES = ((640, 192), (640, 360), (1242, 375))  # of the held-out worlds' images
 RECORDINGS = {"00": "kitti_odometry/sequences/00", "06": "kitti_odometry/sequences/06", "clip": "kitti_raw_clip"}
 VEHICLES = ("car", "truck", "bus")
 OTHERS = {"detector": "yolox_nano_416.onnx", "segmenter": "twinlitenet_640x360.onnx"}
-WHOLE_CURVE = 0.05  # the score from which on boxes count for the average precision
+AP_MIN_SCORE = 0.05  # of boxes in the average precision
 MIN_SCORE = 0.4  # of the other detector's boxes
 MIN_HEIGHT_PX = 30.0
 SAME_IOU = 0.5
-BORDER_PX = 4.0  # a box that comes so near to the image's side may be cut off
-MIN_DISTANCE_M = 2.0  # LiDAR returns nearer than this are the car's own
+BORDER_PX = 4.0  # a box this close to the image border may be truncated
+MIN_DISTANCE_M = 2.0  # nearer LiDAR returns are from the ego
 
 
 def run(arguments: list[str]) -> None:
@@ -60,7 +60,7 @@ def run(arguments: list[str]) -> None:
     network = load_network("multitask", ModelSpec(path=str(options.network), threads=options.threads))
     with Ledger(options.output, label, network=network.describe()) as ledger:
         if importlib.util.find_spec("numba") is None:
-            print("held-out worlds: left out, numba is not installed (extra [train])")
+            print("held-out worlds: skipped, numba is not installed (extra [train])")
         else:
             for width_px, height_px in SIZES:
                 figures = simulated(network, options.frames, width_px, height_px)
@@ -74,17 +74,17 @@ def run(arguments: list[str]) -> None:
             ).items():
                 ledger.add(f"bodies of {name}", _summary(figures), **figures)
         else:
-            print(f"real frames: left out, {options.data} is not there (set BIRDSLAM_DATA)")
+            print(f"real frames: skipped, {options.data} does not exist (set BIRDSLAM_DATA)")
 
 
 def simulated(network: Network, frames: int, width_px: int, height_px: int) -> dict[str, float]:
-    """The figures over held-out worlds: seeds from 0, which training doesn't draw."""
+    """Results over held-out worlds: seeds from 0, which training does not use."""
     from birdslam.world.world import sample
 
     grades = Grades()
     decoder = network.decoder
     assert isinstance(decoder, MultiTaskDecoder)
-    shipped, decoder.table = decoder.table, msgspec.structs.replace(decoder.table, score_threshold=WHOLE_CURVE)
+    shipped, decoder.table = decoder.table, msgspec.structs.replace(decoder.table, score_threshold=AP_MIN_SCORE)
     for seed in range(frames):
         frame = sample(seed, width_px, height_px)
         grades.add(_findings(network, frame.image), frame)
@@ -93,14 +93,14 @@ def simulated(network: Network, frames: int, width_px: int, height_px: int) -> d
 
 
 def real(network: Network, folder: Path, models: Path) -> dict[str, float]:
-    """The figures on a real recording; those that nothing is there to compare with are left out."""
+    """Results on a real recording, without those that lack a reference."""
     recording = open_recording(f"kitti:{folder}")
     others = {role: _other(role, models / file) for role, file in OTHERS.items() if (models / file).is_file()}
     T_cam_cam0 = np.linalg.inv(recording.T_cam0_cam())
     road, lane, shares = np.zeros(2, dtype=np.int64), np.zeros(2, dtype=np.int64), []
     agreed = np.zeros(4, dtype=np.int64)  # theirs found, theirs, ours confirmed, ours
     sizes: list[Floats] = []  # of ours over theirs, see `extents`
-    depths: list[Floats] = []  # (N, 3): said, LiDAR's, on the road
+    depths: list[Floats] = []  # (N, 3): estimated, LiDAR's, on the road
     for number, image in _images(recording.frames()):
         found = _findings(network, image)
         lidar = folder / "lidar_cam0" / f"{number:06d}.npy"
@@ -115,7 +115,7 @@ def real(network: Network, folder: Path, models: Path) -> dict[str, float]:
                 shares.append([mask.road.mean() for mask in (found.segmentation, theirs.segmentation)])
         if "detector" in others:
             theirs = others["detector"].run(image)
-            # Nothing found is an answer too: an image in which one of the two sees nobody counts
+            # Includes images in which one of the networks detects nothing
             if found.detections is not None and theirs is not None and theirs.detections is not None:
                 agreed += _agreement(found.detections, theirs.detections)
                 sizes += _sizes(found.detections, theirs.detections, image.shape[1])
@@ -124,7 +124,7 @@ def real(network: Network, folder: Path, models: Path) -> dict[str, float]:
         figures |= _depth_figures(np.vstack(depths))
     if "segmenter" in others:
         figures |= {"road_iou": float(road[0] / road[1]), "lane_iou": float(lane[0] / lane[1])}
-        ours, theirs = np.mean(shares, axis=0)  # of the image: a mask that is nearly empty is no opinion
+        ours, theirs = np.mean(shares, axis=0)  # of the image; a nearly empty mask is not compared
         figures |= {"road_share": float(ours), "road_share_theirs": float(theirs)}
     if "detector" in others:
         figures |= {
@@ -147,7 +147,7 @@ def real(network: Network, folder: Path, models: Path) -> dict[str, float]:
 def _findings(network: Network, image: NDArray[np.uint8]) -> Findings:
     found = network.run(image)
     if found is None:
-        raise PerfError(f"{network.path}: gave numbers that are not finite")
+        raise PerfError(f"{network.path}: has an output that is not finite")
     return found
 
 
@@ -162,7 +162,7 @@ def _images(frames: Iterator[Any]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
 
 
 def _beside_lidar(found: Findings, points_m: Floats, camera: Camera) -> Floats:
-    """(N, 3) said depth, LiDAR depth, 1 on the predicted road, of the returns in the image."""
+    """Estimated depth, LiDAR depth, 1 on the predicted road (N, 3) of the returns in the image."""
     assert found.depth is not None
     assert found.segmentation is not None
     points_m = points_m[points_m[:, 2] > MIN_DISTANCE_M]
@@ -189,7 +189,7 @@ def _depth_figures(depths: Floats) -> dict[str, float]:
 
 
 def _agreement(ours: Detections, theirs: Detections) -> Ints:
-    """(4,) theirs found among ours, theirs, ours confirmed by theirs, ours: vehicles over the bars."""
+    """Counts (4,) of vehicles above the thresholds: theirs found by ours, theirs, ours confirmed by theirs, ours."""
     ours, theirs = ours.only(VEHICLES), theirs.only(VEHICLES)
     shared = box_ious(theirs.boxes_px[theirs.scores > MIN_SCORE], ours.boxes_px)
     tall_theirs, tall_ours = (
@@ -209,7 +209,7 @@ def _agreement(ours: Detections, theirs: Detections) -> Ints:
 
 
 def _sizes(ours: Detections, theirs: Detections, width_px: int) -> list[Floats]:
-    """Of each vehicle that both see whole, over the bars: our box over theirs."""
+    """Ratio of our box to theirs for each untruncated vehicle above the thresholds that both detect."""
     ours, theirs = ours.only(VEHICLES), theirs.only(VEHICLES)
     out = []
     for box, score in zip(theirs.boxes_px, theirs.scores, strict=True):

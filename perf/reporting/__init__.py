@@ -1,1 +1,1 @@
-"""How figures are kept, compared, drawn and written to pages; `all` runs everything in turn."""
+"""Storage, comparison and reports of results; `all` runs all benchmarks."""

@@ -1,10 +1,10 @@
-"""Everything in turn, each in a fresh process, and one report that a person reads in two minutes.
+"""Runs all benchmarks, each in a fresh process, and writes a short report.
 
     python -m perf all --output DIR [--source URI] [--model ROLE=PATH]... [--thorough]
 
-The default source is the shipped drive with the shipped network, so that it needs no data. DIR gets report.json,
-report.md and the JSON of each benchmark. After Ctrl-C the report contains what was measured until then and names what
-is missing. Without `--thorough` the suite takes about twenty minutes.
+The default source is the shipped drive with the shipped network. DIR gets report.json, report.md and the JSON of each
+benchmark. After Ctrl-C the report has the results so far and names the missing ones. Takes about 20 minutes without
+`--thorough`.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.reporting.figures import write_json
 from birdslam.perf.reporting.machine import describe
 
-label = "every benchmark, and their report"
+label = "all benchmarks, and their report"
 
-END_S = 60.0  # for a benchmark to keep what it has
+END_S = 60.0  # time for a benchmark to save its results
 
 
 @dataclass(frozen=True)
 class Step:
-    """One benchmark with its options: for a quick run, and for figures to be shown."""
+    """One benchmark with its options for a quick and for a thorough run."""
 
     file: str
     benchmark: str
@@ -63,13 +63,13 @@ def run(arguments: list[str]) -> int:
     parser.add_argument("--output", type=Path, required=True, metavar="DIR")
     parser.add_argument("--source", default="demo", metavar="URI", help="default: demo, the shipped drive")
     parser.add_argument("--model", action="append", default=[], metavar="ROLE=PATH", help="default: the shipped one")
-    parser.add_argument("--thorough", action="store_true", help="long enough for figures to be shown")
+    parser.add_argument("--thorough", action="store_true", help="longer runs, for publication")
     parser.add_argument("--only", default="", help="a list of steps: " + ",".join(step.file for step in STEPS))
     options = parser.parse_args(arguments)
     only = options.only.split(",") if options.only else [step.file for step in STEPS]
     unknown = sorted(set(only) - {step.file for step in STEPS})
     if unknown:
-        parser.error(f"there is no step {unknown[0]!r}")
+        parser.error(f"{unknown[0]!r} is not a step")
     options.output.mkdir(parents=True, exist_ok=True)
     command = f"python -m perf {shlex.join(sys.argv[1:])}"
     head = {"command": command, "source": options.source, "models": options.model, "machine": describe()}
@@ -87,7 +87,7 @@ def run(arguments: list[str]) -> int:
 
 
 def run_step(step: Step, options: argparse.Namespace) -> str:
-    """How it ended. What it prints goes to the terminal as it comes."""
+    """Runs a step, with its output on the terminal; returns its outcome."""
     file = options.output / f"{step.file}.json"
     file.unlink(missing_ok=True)
     command = [sys.executable, "-m", "birdslam.perf", step.benchmark, "--output", str(file)]
@@ -110,7 +110,7 @@ def run_step(step: Step, options: argparse.Namespace) -> str:
 
 
 def _write(folder: Path, head: dict[str, Any], outcome: dict[str, str]) -> None:
-    """After each step, so that nothing is lost."""
+    """Writes the report, after each step."""
     benchmarks = {}
     for name in outcome:
         file = folder / f"{name}.json"

@@ -1,9 +1,9 @@
-"""Two reports, figure by figure, with the noise of both: better, worse or not distinguishable.
+"""Compares two reports, result by result, with the noise of both: better, worse or not distinguishable.
 
     python -m perf compare A.json B.json          # A is the old one; A1.json,A2.json: several runs of one side
 
-Mann-Whitney U on the blocks of each series, two-sided, false discoveries of all figures together below 1 %; only a
-shift of more than 5 % counts. Exit status: 1 where something is worse, 2 where the reports can't be compared.
+Mann-Whitney U on the blocks of each series, two-sided, with a false discovery rate below 1 %; only shifts over 5 %
+count. Exit status: 1 if a result is worse, 2 if the reports can't be compared.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from birdslam.perf.reporting.arguments import benchmark_parser
 label = "two reports: better, worse or not distinguishable"
 
 FALSE_DISCOVERIES = 0.01
-MIN_SHIFT = 0.05  # of the old value; a smaller one is nobody's concern
+MIN_SHIFT = 0.05  # of the old value
 Verdict = Literal["better", "worse", "not distinguishable"]
 
 
@@ -40,9 +40,9 @@ class Verdicts:
 
 def run(arguments: list[str]) -> int:
     parser = benchmark_parser("compare", label, output="")
-    parser.add_argument("old", metavar="A.json", help="a report, or one benchmark's JSON; a list of several runs")
+    parser.add_argument("old", metavar="A.json", help="report or benchmark's JSON; several runs as A1,A2")
     parser.add_argument("new", metavar="B.json")
-    parser.add_argument("--all", action="store_true", help="show what is not distinguishable, too")
+    parser.add_argument("--all", action="store_true", help="also show results that are not distinguishable")
     options = parser.parse_args(arguments)
     old, new = _read(options.old), _read(options.new)
     machines = {report["machine"]["cpu"] for report in (*old, *new) if isinstance(report, dict) and "machine" in report}
@@ -65,12 +65,12 @@ def _read(paths: str) -> list[Any]:
         except OSError as error:
             raise PerfError(f"{path}: {error.strerror}") from error
         except ValueError as error:
-            raise PerfError(f"{path}: no JSON: {error}") from error
+            raise PerfError(f"{path}: not JSON: {error}") from error
     return reports
 
 
 def compare(old: list[Any], new: list[Any]) -> list[Verdicts]:
-    """All figures that both sides have, in their order. Raises PerfError where there is none."""
+    """Compares all results that both sides have, in order. Raises PerfError if there are none."""
     sides = []
     for reports in (old, new):
         pooled: dict[str, list[float]] = {}
@@ -80,14 +80,14 @@ def compare(old: list[Any], new: list[Any]) -> list[Verdicts]:
         sides.append(pooled)
     names = [name for name in sides[0] if name in sides[1]]
     if not names:
-        raise PerfError("the two have no figure in common")
+        raise PerfError("the reports have no result in common")
     tests = [(name, sides[0][name], sides[1][name], _p(name, sides[0][name], sides[1][name])) for name in names]
     adjusted = false_discovery_control([p for *_, p in tests])
     return [_judge(name, a, b, float(p)) for (name, a, b, _), p in zip(tests, adjusted, strict=True)]
 
 
 def figures(content: Any, path: str = "") -> Iterator[tuple[str, list[float]]]:
-    """(name, blocks) of everything in a report that knows its noise; [dropped, of] of counts, [value] of exact ones."""
+    """(name, blocks) of all results with noise in a report; [dropped, of] for counts, [value] for exact results."""
     if isinstance(content, list):
         for number, item in enumerate(content):
             name = item.get("name", number) if isinstance(item, dict) else number
@@ -105,14 +105,14 @@ def figures(content: Any, path: str = "") -> Iterator[tuple[str, list[float]]]:
 
 
 def _p(name: str, old: list[float], new: list[float]) -> float:
-    """How likely so great a difference is by chance."""
+    """The p-value of the difference."""
     if name.endswith("(exact)"):
         return float(old[0] == new[0])
     if name.endswith("dropped"):
         (lost, of), (lost_new, of_new) = ((sum(side[::2]), sum(side[1::2])) for side in (old, new))
         if not lost + lost_new:
             return 1.0
-        # Drops come in bursts: each counts as a tenth of an independent one, rounded up
+        # Drops are correlated: ten count as one independent drop, rounded up
         few, few_new = -(-lost // 10), -(-lost_new // 10)
         return float(binomtest(int(few_new), int(few + few_new), of_new / (of + of_new)).pvalue)
     return float(mannwhitneyu(old, new).pvalue) if old != new else 1.0
@@ -126,5 +126,5 @@ def _judge(name: str, old: list[float], new: list[float], p: float) -> Verdicts:
     shifted = abs(b - a) > MIN_SHIFT * abs(a)
     verdict: Verdict = "not distinguishable"
     if p < FALSE_DISCOVERIES and shifted:
-        verdict = "worse" if abs(b) > abs(a) else "better"  # of everything that is measured here less is better
+        verdict = "worse" if abs(b) > abs(a) else "better"  # smaller is better for all results
     return Verdicts(name, a, b, p, verdict)

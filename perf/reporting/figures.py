@@ -1,4 +1,4 @@
-"""How figures are kept: distributions with their noise, in a file that is whole after every row."""
+"""Storage of results: distributions with their noise, in a file that is complete after every row."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from numpy.typing import ArrayLike
 from birdslam.geometry.arrays import Floats
 from birdslam.perf.reporting.machine import Steal, describe, describe_text
 
-BLOCKS = 10  # a series is cut into so many pieces one after the other; how they differ is its noise
+BLOCKS = 10  # consecutive parts of a series; their spread is its noise
 _LEVELS = (0.0, 1.0, 5.0, *range(10, 91, 10), 95.0, 98.0, 99.0, 99.5, 99.9, 99.99)  # percent, for the plots
 
 
 def spread(values: ArrayLike) -> dict[str, float]:
-    """p50, p99, p999 and max of a series, and how many there are; without figures where it is empty."""
+    """p50, p99, p999, max and count of a series; only the count if it is empty."""
     series = np.asarray(values, dtype=np.float64)
     if not series.size:
         return {"n": 0}
@@ -38,7 +38,7 @@ def noise(name: str, values: ArrayLike) -> dict[str, list[float]]:
 
 
 def curve(values: ArrayLike) -> list[list[float]]:
-    """(percent, value) pairs of the cumulative distribution, denser where the tail is, as far as samples reach."""
+    """(percent, value) pairs of the cumulative distribution, denser in the tail, as far as the samples allow."""
     series: Floats = np.asarray(values, dtype=np.float64)
     if not series.size:
         return []
@@ -47,9 +47,9 @@ def curve(values: ArrayLike) -> list[list[float]]:
 
 
 class Ledger:
-    """One benchmark's results, written to `path` (None: nowhere) whenever a row comes in; a context manager.
+    """One benchmark's results, written to `path` (None: not written) after each row; a context manager.
 
-    On Ctrl-C it keeps what was measured and says so: `complete` stays false.
+    On Ctrl-C the results so far are kept and `complete` stays false.
     """
 
     def __init__(self, path: Path | None, label: str, **settings: Any) -> None:
@@ -66,13 +66,13 @@ class Ledger:
         print(describe_text(self.content["machine"]), file=sys.stderr)
 
     def add(self, name: str, shown: str, **row: Any) -> None:
-        """A row, named once in the file, and what a person sees of it."""
+        """Adds a row with a unique name, and prints it as `shown`."""
         self.content["rows"].append({"name": name, **row})
         self._write()
         print(f"{name:44} {shown}", flush=True)
 
     def set(self, **figures: Any) -> None:
-        """Figures beside the rows."""
+        """Sets results outside the rows."""
         self.content |= figures
         self._write()
 
@@ -90,7 +90,7 @@ class Ledger:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Whole or not at all."""
+    """Writes a file atomically."""
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(path.name + ".draft")
     draft.write_text(json.dumps(content, indent=1, default=_plain) + "\n", encoding="utf-8")
@@ -100,11 +100,11 @@ def write_json(path: Path, content: Any) -> None:
 def _plain(value: Any) -> Any:
     if isinstance(value, np.generic):
         return value.item()
-    raise TypeError(f"{type(value).__name__} has no place in a report")
+    raise TypeError(f"a report can't contain a {type(value).__name__}")
 
 
 def spread_text(figures: dict[str, float], unit: str) -> str:
-    """A spread for a person."""
+    """A spread as text."""
     if not figures.get("n"):
         return "nothing came"
     return "  ".join(f"{name} {figures[name]:.3g}" for name in ("p50", "p99", "max")) + f" {unit}"

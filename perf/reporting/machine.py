@@ -1,4 +1,4 @@
-"""The machine that is measured on: what it is, and what the hypervisor takes from it."""
+"""The machine under test: its description, and the CPU time that the hypervisor steals."""
 
 from __future__ import annotations
 
@@ -50,18 +50,18 @@ def _git(*arguments: str) -> str:
     try:
         done = subprocess.run(["git", "-C", str(ROOT), *arguments], capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):
-        return ""  # an installed copy without its history
+        return ""  # not a git checkout
     return done.stdout.strip()
 
 
 class Steal:
-    """The share of processor time that the hypervisor gave to others since construction."""
+    """The share of CPU time stolen by the hypervisor since construction."""
 
     def __init__(self) -> None:
         self._started = _ticks()
 
     def percent(self) -> float:
-        """Of all time of all cores."""
+        """Percent of the time of all cores."""
         passed = [now - then for now, then in zip(_ticks(), self._started, strict=True)]
         return round(100.0 * passed[_STEAL] / max(1, sum(passed)), 3)
 

@@ -1,10 +1,9 @@
-"""Ours over a peer in the same run, which holds across machines; each has a bound that a change must not pass.
+"""Ratios of our results to those of an alternative in the same run, which hold across machines, with upper bounds.
 
     python -m perf ratios [--rounds 3] [--output F.json]
 
-The pairs run one after the other, in several rounds; a bound is held against the median of the rounds: a neighbour that
-disturbs one of three does not fail it, and one lucky round does not pass it. `perf/reference.toml` says what was
-measured, and the bounds.
+The pairs run one after the other, in several rounds; the median of the rounds must not exceed the bound.
+`perf/reference.toml` has the measured ratios and the bounds.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from birdslam.perf.latency.drive import DriveConfig
 from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
 
-label = "ours over its peers in one run, against the reference"
+label = "ratios to alternatives in one run, compared with the reference"
 
 REFERENCE = Path(__file__).parent.parent / "reference.toml"
 FRAMES, LIMIT_S = 300, 10.0
@@ -30,14 +29,14 @@ RATE_HZ, TRANSPORT_S = 200, 0.6
 
 
 class Bound(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What the ratio was when it was written down, and what it must not exceed."""
+    """The reference value of a ratio, and its upper bound."""
 
     measured: float
     bound: float
 
 
 def reference() -> dict[str, Bound]:
-    """perf/reference.toml."""
+    """Reads perf/reference.toml."""
     return msgspec.convert(tomllib.loads(REFERENCE.read_text(encoding="utf-8")), dict[str, Bound])
 
 
@@ -64,12 +63,12 @@ def run(arguments: list[str]) -> int:
 
 
 def worse(found: dict[str, list[float]], bounds: dict[str, Bound]) -> list[str]:
-    """The ratios whose median over the rounds is past their bound."""
+    """The ratios whose median over the rounds exceeds the bound."""
     return [name for name, values in found.items() if np.median(values) > bounds[name].bound]
 
 
 def measure(rounds: int) -> dict[str, list[float]]:
-    """Each ratio, round for round."""
+    """The values of each ratio per round."""
     out: dict[str, list[float]] = {}
     pairs: tuple[Callable[[], Iterator[tuple[str, float]]], ...] = (_pixels, _records, _back_end)
     for _ in range(rounds):
@@ -80,7 +79,7 @@ def measure(rounds: int) -> dict[str, list[float]]:
 
 
 def _pixels() -> Iterator[tuple[str, float]]:
-    """A colour frame through the ring, and through zenoh over a socket."""
+    """A colour frame through the ring, compared with zenoh over a socket."""
     size = max(transport.SIZES_B)
     rows = [transport.measure(transport.Case(c, size, RATE_HZ, 0), TRANSPORT_S) for c in ("ring", "zenoh")]
     ours, peer = ([row["latency_ms"]["p50"], sum(row["cpu_percent"].values())] for row in rows)
@@ -89,13 +88,13 @@ def _pixels() -> Iterator[tuple[str, float]]:
 
 
 def _records() -> Iterator[tuple[str, float]]:
-    """A typed record that is checked at both ends, and bare bytes."""
+    """A typed record validated at both ends, compared with raw bytes."""
     rows = [transport.measure(transport.Case(c, 4_000, RATE_HZ, 0), TRANSPORT_S) for c in ("bus", "zenoh")]
     yield "bus over bare zenoh, 4 kB, cpu", sum(rows[0]["cpu_percent"].values()) / sum(rows[1]["cpu_percent"].values())
 
 
 def _back_end() -> Iterator[tuple[str, float]]:
-    """The pose graph beside gtsam's fixed-lag smoother, and over vehicles and frames."""
+    """The pose graph compared with gtsam's fixed-lag smoother, and its growth with vehicles and frames."""
     with tempfile.TemporaryDirectory(prefix="perf") as folder:
         took = {}
         for contender, vehicles in (("ours", 3), ("ours", 15), ("incremental_fixed_lag_qr", 15)):

@@ -1,4 +1,4 @@
-"""report.md: what a person reads in two minutes, from what the benchmarks wrote."""
+"""Writes report.md, the summary of the benchmarks' results."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 from birdslam.perf.reporting.machine import ROOT
 from birdslam.runtime.latency import key_of
 
-FEW = 1000
+MIN_FOR_P999 = 1000  # samples
 Row = Mapping[str, Any]
 Benchmarks = Mapping[str, Mapping[str, Any]]
 
@@ -31,7 +31,7 @@ def markdown(content: Mapping[str, Any]) -> str:
 
 
 def table(titles: Iterable[str], rows: Iterable[Iterable[object]]) -> Iterator[str]:
-    """Markdown; numbers to three digits."""
+    """A Markdown table; numbers have three digits."""
     titles = list(titles)
     yield f"| {' | '.join(titles)} |"
     yield f"|{'---|' * len(titles)}"
@@ -50,7 +50,7 @@ def _cell(value: object) -> str:
 
 
 def _percentiles(figures: Mapping[str, Any], names: tuple[str, ...] = ("p50", "p99", "p999", "max")) -> list[object]:
-    few = figures.get("n", 0) < FEW  # then p99.9 says no more than the maximum
+    few = figures.get("n", 0) < MIN_FOR_P999  # p99.9 would be the maximum
     return [None if few and name == "p999" else figures.get(name) for name in names]
 
 
@@ -61,7 +61,7 @@ def _head(content: Mapping[str, Any]) -> str:
     changed = f" with {machine['uncommitted_files']} files not committed" if machine["uncommitted_files"] else ""
     missing = [f"{name}: {how}" for name, how in content["outcome"].items() if how != "complete"]
     lines = [
-        "# What BirdSLAM does on this machine",
+        "# BirdSLAM's performance on this machine",
         "",
         f"    {content['command']}",
         "",
@@ -72,8 +72,8 @@ def _head(content: Mapping[str, Any]) -> str:
         f"- configuration: {_configuration(content['benchmarks'])}",
         *(f"- **{line}**" for line in missing),
         "",
-        "All times are in ms unless they say otherwise, at p50, p99, p99.9 and max. `steal` is the share of processor "
-        "time that the hypervisor gave to others meanwhile: where it is not near 0, the tail is the machine's.",
+        "Times are in ms unless stated otherwise, at p50, p99, p99.9 and max. `steal` is the share of CPU time that "
+        "the hypervisor took; if it is not near 0, it determines the tail.",
     ]
     return "\n".join(lines)
 
@@ -88,7 +88,7 @@ def _configuration(benchmarks: Benchmarks) -> str:
 
 
 def _set(key: str, value: object) -> Iterator[str]:
-    """KEY=VALUE of everything below a key that is not left to others."""
+    """KEY=VALUE of all settings below a key that are not None."""
     if isinstance(value, Mapping):
         for name, below in value.items():
             yield from _set(f"{key}.{name}", below)
@@ -112,7 +112,7 @@ def _system(benchmarks: Benchmarks) -> Iterator[str]:
         ),
     )
     for name, run in runs.items():
-        yield f"\n**{name}**, where an estimate's age comes from (the means add up to {run['age_ms']['mean']:.2f}):\n"
+        yield f"\n**{name}**, parts of an estimate's age (the means add up to {run['age_ms']['mean']:.2f}):\n"
         budgets = {row["budget"]: row for row in run["budgets"]}
         rows = []
         for stage, figures in [*run["stages"].items(), ("whole", run["age_ms"])]:
@@ -127,10 +127,7 @@ def _system(benchmarks: Benchmarks) -> Iterator[str]:
         f"{name}: " + ", ".join(f"{process} {cores:.2f}" for process, cores in run["cpu_cores_by"].items())
         for name, run in runs.items()
     )
-    yield (
-        "\nMB is every process at its most, spares included, with the pages that it shares with others; MB shared once "
-        "counts those once (PSS)."
-    )
+    yield ("\nMB is the sum of the processes' maxima, spares included; MB shared once counts shared pages once (PSS).")
 
 
 def _optimizer(benchmarks: Benchmarks) -> Iterator[str]:
@@ -152,7 +149,7 @@ def _optimizer(benchmarks: Benchmarks) -> Iterator[str]:
 def _table_of(
     benchmark: str, titles: Sequence[str], cells: Callable[[Row], Iterable[object]], before: str = ""
 ) -> Callable[[Benchmarks], Iterator[str]]:
-    """A section that is one table, a row for each of a benchmark's; nothing where it has none."""
+    """A section with one table of a benchmark's rows; empty without rows."""
 
     def section(benchmarks: Benchmarks) -> Iterator[str]:
         rows = benchmarks.get(benchmark, {}).get("rows", [])
@@ -170,7 +167,7 @@ _vehicles = _table_of(
         *(row["vehicles"], *_percentiles(row["step_ms"]), row["cpu_cores"], row["rss_mb"]),
         *(f"{row['dropped']} of {row['frames']}", row["steal_percent"]),
     ],
-    "The optimize process on the real bus, at the rate, with so many vehicles in sight:\n",
+    "The optimize process on the real bus, at the rate, with this number of visible vehicles:\n",
 )
 _transport = _table_of(
     "transport",

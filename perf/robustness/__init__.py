@@ -1,1 +1,1 @@
-"""What faults do to a running vehicle, what a long drive does, and many vehicles at one router."""
+"""Robustness: faults of a running vehicle, long drives, variants of videos."""

@@ -1,10 +1,9 @@
-"""The fault suite: a running vehicle, one fault after the other, and what its planner sees of each.
+"""The fault suite: injects faults into a running vehicle and records what its planner receives.
 
     python -m perf faults [--models DIR] [--markdown FILE] [NAME ...]
 
-Each row: how long until the planner has a valid estimate again (from the fault's beginning where a process is hit, from
-its end where the world is), the statuses meanwhile, how far the poses that were marked valid were off, and whether
-anything was marked valid that was not: by its own status, or by where the car really was (perf/robustness/judge.py).
+Each row has the time until the next valid estimate (from the start of a fault of a process, from the end of a fault of
+the environment), the statuses, the error of valid poses, and the number of wrong valid ones (judge.py).
 """
 
 from __future__ import annotations
@@ -28,24 +27,23 @@ from birdslam.perf.robustness.injection import FAULTS, Fault
 from birdslam.perf.robustness.judge import Judge
 from birdslam.types import Estimate
 
-label = "a running vehicle, one fault after the other, and what its planner sees of each"
+label = "faults of a running vehicle, and what its planner receives"
 
 PAGE = """\
 # Faults
 
-Made by `make faults`, which breaks a running vehicle in {faults} ways and looks on as its planner. A test holds the
-rows to the suite (`perf/robustness/injection.py` has the faults, `perf/robustness/judge.py` the planner that judges).
+Written by `make faults`, which injects {faults} faults into a running vehicle (`perf/robustness/injection.py`) and
+evaluates the estimates at its planner (`perf/robustness/judge.py`).
 
 {machine}
 
-*Valid again after* counts from the fault's beginning where it hits a process, and from its end where it hits the world
-(a camera that is gone, frames that come late). *Off by* is the largest distance between a pose that was called valid
-and where the car was. A *wrong pose* was called valid and off by more than 5 % of the way; a *wrongly valid* one came
-while nothing could be known.
+*Valid again after* counts from the start of a fault of a process, and from the end of a fault of the environment
+(a missing camera, late frames). *Off by* is the largest error of a pose marked valid. A *wrong pose* is marked valid
+with an error over 5 % of the distance travelled; a *wrongly valid* one is marked valid without any usable image.
 
 {table}
 """
-BEFORE_S, AFTER_S = 0.3, 1.5  # so long before and after, estimates are collected: a wrong pose may come late
+BEFORE_S, AFTER_S = 0.3, 1.5  # estimates are collected this long before and after: a wrong pose may come late
 
 
 @dataclass
@@ -64,7 +62,7 @@ class Row:
 
 
 def measure(vehicle: Vehicle, fault: Fault) -> Row:
-    """One fault, from before its beginning until the planner drives on."""
+    """Injects one fault and observes until estimates are valid again."""
     judge = Judge(vehicle.truth_m, FRAME_M)
 
     def observe(estimate: Estimate | None) -> bool:
@@ -83,7 +81,7 @@ def measure(vehicle: Vehicle, fault: Fault) -> Row:
         judge.see(estimate)
         return estimate is not None and estimate.valid and estimate.t_capture_ns >= ended_ns
 
-    # A fault of a process is over when it begins: it counts from there; one of the world counts from its end
+    # Time counts from the start of a fault of a process, from the end of a fault of the environment
     back = vehicle.watch(well, PATIENCE_S)
     after_ms = (judge.estimates[-1][0] - ended_ns) / 1e6 if back else None
     seen = judge.summary()
@@ -102,21 +100,21 @@ def measure(vehicle: Vehicle, fault: Fault) -> Row:
 
 
 def page(rows: list[Row]) -> str:
-    """A page: the table with its head."""
+    """The page with the table."""
     m = describe()
     machine = f"Measured {m['utc']} on {m['cpu']}, {m['cores']} cores, {m['kernel']}, at commit {m['commit']}."
     return PAGE.format(faults=len(rows), machine=machine, table=markdown(rows))
 
 
 def markdown(rows: list[Row]) -> str:
-    """The table of such a page."""
+    """The table."""
     lines = [
-        "| fault | hits | valid again after | what the planner saw meanwhile "
+        "| fault | hits | valid again after | what the planner received "
         "| valid poses off by | wrong poses | wrongly valid |",
         "|---|---|---|---|---|---|---|",
     ]
     for row in rows:
-        after = "not within its patience" if row.valid_after_ms is None else f"{row.valid_after_ms:.0f} ms"
+        after = "not within the time limit" if row.valid_after_ms is None else f"{row.valid_after_ms:.0f} ms"
         promise = f" (promise {row.promise_s:g} s)" if row.promise_s else ""
         back = f"; frame numbers fell {row.backwards} times" if row.backwards else ""
         lines.append(
@@ -127,11 +125,11 @@ def markdown(rows: list[Row]) -> str:
 
 
 def run(arguments: list[str]) -> int:
-    """0 where every fault was survived, within its promise, and nothing wrong was marked valid."""
+    """Returns 0 if the vehicle survived every fault in time and no wrong estimate was marked valid."""
     parser = benchmark_parser("faults", label, output="")
     parser.add_argument("names", nargs="*", metavar="NAME", help="only faults whose name contains one of these")
-    parser.add_argument("--models", type=Path, help="folder of networks, for perceive to carry their weight")
-    parser.add_argument("--markdown", type=Path, help="the page goes there, table and head")
+    parser.add_argument("--models", type=Path, help="folder of networks for perceive")
+    parser.add_argument("--markdown", type=Path, help="file for the page")
     options = parser.parse_args(arguments)
     ends_with_its_vehicle()
     chosen = [f for f in FAULTS if not options.names or any(name in f"{f.name} {f.node}" for name in options.names)]
@@ -152,7 +150,7 @@ def run(arguments: list[str]) -> int:
 
 
 def survived(row: Row, slack: float = 1.0) -> bool:
-    """Valid again, within its promise (times `slack`), nothing marked valid that was not, no frame number fell."""
+    """Whether estimates were valid again in time (times `slack`), none wrongly, and frame numbers never fell."""
     limit_ms = None if row.promise_s is None else row.promise_s * slack * 1e3
     in_time = row.valid_after_ms is not None and (limit_ms is None or row.valid_after_ms <= limit_ms)
     return in_time and row.wrongly_valid == 0 and row.wrong_poses == 0 and row.backwards == 0

@@ -1,7 +1,7 @@
-"""A running vehicle whose camera can be made to fail, with a planner that watches it: for faults.py and soak.py.
+"""A running vehicle with a faulty software camera, and a planner that observes it, for faults.py and soak.py.
 
-The camera is software (faulty_camera/): a street without end (perf/accuracy/street.py), driven along at constant speed,
-so that where the car is follows from the time alone.
+The camera (faulty_camera/) shows an endless street (perf/accuracy/street.py) at constant speed, so that time determines
+the true position.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ VITALS = "memfd:birdslam-vitals"
 
 
 def ends_with_its_vehicle() -> None:
-    """SIGTERM ends the suite as Ctrl-C does, and its vehicle with it."""
+    """Makes SIGTERM end the suite and its vehicle, as Ctrl-C does."""
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
 
 
 class Vehicle:
     """`birdslam run` with the faulty camera, and a planner; a context manager.
 
-    `source` takes the camera's place: a recording, round and round.
+    `source`: a recording, played in a loop, that replaces the camera.
     """
 
     vehicle = "faults"
@@ -63,7 +63,7 @@ class Vehicle:
         self.start()
 
     def _make_camera(self) -> None:
-        """It takes the place of OpenCV's in every process of the vehicle."""
+        """Writes the software camera, which replaces OpenCV's in all processes of the vehicle."""
         path = os.pathsep.join(
             [str(ROOT / "perf" / "robustness" / "faulty_camera"), str(ROOT), os.environ.get("PYTHONPATH", "")]
         )
@@ -78,7 +78,7 @@ class Vehicle:
         )
 
     def start(self) -> None:
-        """Starts the system; again, where it was killed."""
+        """Starts the system, also after it was killed."""
         settings = {"runtime.runtime_dir": self.runtime_dir, "runtime.restarts_max": 1000, "runtime.watchdog_ms": 1000}
         with (self.place / "run.log").open("ab") as log:
             self.process = subprocess.Popen(
@@ -95,25 +95,25 @@ class Vehicle:
             )
 
     def fault(self, name: str) -> None:
-        """The camera does this from its next frame on."""
+        """Sets the camera's fault from the next frame on."""
         draft = self.camera / "draft"
         draft.write_text(name)
         draft.rename(self.camera / "fault")
 
     def truth_m(self, t_capture_ns: int) -> float:
-        """How far along the road the camera was then, to within a frame."""
+        """True position along the road, to within one frame."""
         return math.floor(t_capture_ns * 1e-9 * self.rate_hz) * FRAME_M
 
     def node(self, name: str) -> psutil.Process:
-        """The process of a node that is at work."""
+        """The active process of a node."""
         return self.processes()[name]
 
     def spares(self) -> int:
-        """Processes that stand by, with all loaded."""
+        """The number of prepared spare processes."""
         return sum(map(_is_prepared, psutil.Process(self.process.pid).children())) - len(NODES)
 
     def processes(self) -> dict[str, psutil.Process]:
-        """All of them by name: the supervisor, the nodes, the spare of each, and the recorder where there is one."""
+        """All processes by name: supervisor, nodes, spares, and the recorder if there is one."""
         return processes_of(self.process.pid, PROCESSES)
 
     def __enter__(self) -> Self:
@@ -122,9 +122,9 @@ class Vehicle:
         return self
 
     def settle(self, settle_s: float = SETTLE_S) -> None:
-        """Until estimates are valid and have been for a while, and what spares there are to be stand by.
+        """Waits until estimates have been valid for `settle_s` and all spares are prepared.
 
-        A spare loads where nobody else wants a core, which on a busy machine is never: here it need not wait.
+        Spares load at idle priority, which may take forever on a busy machine; their priority is raised here.
         """
         until_s, calm_s = time.monotonic() + 12 * PATIENCE_S, 0.0
         while calm_s < settle_s or self.spares() < self._spares:
@@ -142,7 +142,7 @@ class Vehicle:
                     realtime.raise_from_idle(process.pid)
 
     def watch(self, see: Callable[[Estimate | None], bool], limit_s: float) -> bool:
-        """Shows what the planner gets (None: nothing for a moment), until `see` says enough; whether it did in time."""
+        """Passes each estimate (None: none for a moment) to `see` until it returns true; False after `limit_s`."""
         end_s = time.monotonic() + limit_s
         while time.monotonic() < end_s:
             if see(self.planner.wait(0.05)):
@@ -150,7 +150,7 @@ class Vehicle:
         return False
 
     def stop(self) -> int:
-        """An ordered end; gives the exit status."""
+        """Shuts down in order; returns the exit status."""
         self.process.terminate()
         return self.process.wait(6 * PATIENCE_S)
 
@@ -165,26 +165,26 @@ class Vehicle:
 
 
 def _is_prepared(process: psutil.Process) -> bool:
-    """By the counters that it shares with its supervisor (runtime/process/vitals.py); a recorder never is."""
+    """Whether a spare is prepared, by its counters (runtime/process/vitals.py); false for a recorder."""
     try:
         for descriptor in Path(f"/proc/{process.pid}/fd").iterdir():
             if VITALS in os.readlink(descriptor):
                 counters = np.frombuffer(descriptor.read_bytes(), dtype=np.int64)
                 return bool(counters[COUNTERS.index("prepared")])
-    except OSError:  # it has just ended
+    except OSError:  # the process has ended
         return False
     return False
 
 
 def record_options(place: Path) -> list[str]:
-    """A recording of each start."""
+    """The options for a recording of each start."""
     folder = place / "recordings"
     folder.mkdir(exist_ok=True)
     return ["--record", str(folder)]
 
 
 def model_options(folder: Path | None) -> list[str]:
-    """Both networks, where the folder has them."""
+    """The options for both networks, if the folder has them."""
     networks = {"detector": "yolox_nano_416.onnx", "segmenter": "twinlitenet_640x360.onnx"}
     if folder is None or not all((folder / file).is_file() for file in networks.values()):
         return []

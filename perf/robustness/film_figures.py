@@ -1,4 +1,4 @@
-"""What the ego-motion of a film came to: valid frames, the first of them, speed over the truth; table and plot."""
+"""Results of the ego-motion of a film: valid frames, time of the first, speed relative to the truth; table and plot."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ import matplotlib.pyplot as plt
 
 TrueSpeed = Callable[[float, float], float]  # m/s between two times in s of the recording
 
-BEGINNING_S = 2.0  # of a film, after which it should be valid
-ALIKE = 0.03  # of the way: so near the variants of one film should be
-_DRIVES_MPS = 1.0  # slower than that a ratio of speeds says little
+BEGINNING_S = 2.0  # time after which estimates should be valid
+ALIKE = 0.03  # max. relative difference of distance between variants of one film
+MIN_SPEED_MPS = 1.0  # below it a ratio of speeds is meaningless
 
 
 @dataclass
 class Course:
-    """What a variant came to: each motion's end and duration (s), speed (m/s), the true one, whether it is valid.
+    """The motions of a variant: end and duration (s), speed and true speed (m/s), validity.
 
-    `sigma_rel` is 1-sigma of its length as a fraction, the camera's share included; `stands` whether it says so.
+    `sigma_rel` is the relative 1-sigma of its length, including the camera's; `stands` whether it reports standstill.
     """
 
     t_s: list[float] = field(default_factory=list)
@@ -49,7 +49,7 @@ class Course:
         sigma_rel: float,
         stands: bool = False,
     ) -> None:
-        """The next motion."""
+        """Adds a motion."""
         self.t_s.append(t_s)
         self.lasts_s.append(lasts_s)
         self.speed_mps.append(speed_mps)
@@ -60,7 +60,7 @@ class Course:
 
 
 def course_of_run(path: Path, true_mps: TrueSpeed) -> Course:
-    """Of the frames.csv that `birdslam run` left."""
+    """Reads the frames.csv of `birdslam run`."""
     course = Course()
     with path.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
@@ -75,12 +75,12 @@ def course_of_run(path: Path, true_mps: TrueSpeed) -> Course:
 
 
 def summary(course: Course, between_mps: tuple[float, float] = (0.0, np.inf)) -> dict[str, Any]:
-    """The figures of a row; `between_mps` is as slow and as fast as the car may have driven."""
+    """The results of a row; `between_mps` are the bounds of the true speed."""
     t_s, valid, true_mps = np.array(course.t_s), np.array(course.valid, bool), np.array(course.true_mps)
     speed_mps = np.array(course.speed_mps)
     ratio = speed_mps / np.maximum(true_mps, 0.1)
     late = t_s > BEGINNING_S
-    counted = valid & late & (true_mps > _DRIVES_MPS)
+    counted = valid & late & (true_mps > MIN_SPEED_MPS)
     median = float(np.median(ratio[counted])) if counted.any() else None
     return {
         "frames": len(t_s),
@@ -92,16 +92,15 @@ def summary(course: Course, between_mps: tuple[float, float] = (0.0, np.inf)) ->
         "sigma_rel": float(np.median(np.array(course.sigma_rel)[counted])) if counted.any() else None,
         "by_second": _by_second(course),
         "beyond_s": _beyond_s(course),
-        "standstill": int((np.array(course.stands, bool) & (true_mps > _DRIVES_MPS)).sum()),
+        "standstill": int((np.array(course.stands, bool) & (true_mps > MIN_SPEED_MPS)).sum()),
         "outside": int((valid & ((speed_mps < between_mps[0]) | (speed_mps > between_mps[1]))).sum()),
     }
 
 
 def _by_second(course: Course) -> list[float | None]:
-    """The way over the true one of the valid motions of each second.
+    """Ratio of estimated to true distance of the valid motions of each second.
 
-    Of ways and not of frames: KITTI's every third true step may be a tenth too long, so that a median over frames is
-    another one at another rate.
+    Ratios of distances rather than frames: KITTI's true steps are uneven, so a median over frames depends on the rate.
     """
     t_s, lasts_s, valid = np.array(course.t_s), np.array(course.lasts_s), np.array(course.valid, bool)
     way_m, true_m = np.array(course.speed_mps) * lasts_s, np.array(course.true_mps) * lasts_s
@@ -114,7 +113,7 @@ def _by_second(course: Course) -> list[float | None]:
 
 
 def _beyond_s(course: Course) -> int:
-    """Seconds whose way is off by more than two of its own 1-sigma."""
+    """Number of seconds with a distance error over two sigma."""
     t_s, valid, sigma_rel = np.array(course.t_s), np.array(course.valid, bool), np.array(course.sigma_rel)
     beyond = 0
     for second, ratio in enumerate(_by_second(course)):
@@ -124,13 +123,13 @@ def _beyond_s(course: Course) -> int:
 
 
 def over(figures: dict[str, Any], unchanged: dict[str, Any]) -> float | None:
-    """The way over that of the unchanged film: median over the seconds in which both are valid."""
+    """Ratio of distance to that of the unchanged film: median over the seconds in which both are valid."""
     both = [(a, b) for a, b in zip(figures["by_second"], unchanged["by_second"], strict=False) if a and b]
     return float(np.median([a / b for a, b in both])) if both else None
 
 
 def row_text(figures: dict[str, Any]) -> str:
-    """A row for a person."""
+    """A row as text."""
     return (
         f"valid {figures['valid_after_2_s']:.0%} from {_text(figures['first_valid_s'], '.2f')} s on  speed over truth "
         f"{_text(figures['speed_over_truth'], '.3f')} +- {_text(figures['deviation'], '.1%')}  over the unchanged "
@@ -145,21 +144,20 @@ def _text(figure: float | None, form: str) -> str:
 
 
 def page(rows: list[dict[str, Any]]) -> str:
-    """The rows as a page, a table for each part."""
+    """The rows as a page with a table per part."""
     lines = [
-        "# One film, otherwise",
+        "# Variants of films",
         "",
-        "Each recording at hand at other sizes and rates, through H.264, with something in the way, and begun later",
-        "(`python -m perf films`): does the same drive give the same metres? Valid frames and speed count",
-        "after the first 2 s; *over* is the speed over that of the unchanged film, the median over seconds;",
-        "*deviation* is the median deviation of the speed over the truth from its own median. `town`: the truth is GPS",
-        "at 1 Hz, in whole km/h; its lens is unknown: a constant factor is that of its focal length and height.",
-        "`town_72` is driven by the view across with which its metres are GPS's, in place of the 60 degrees stated. Of",
-        "`rain` nothing is known but that it drives, at 15 to 35 m/s. *Beyond* are seconds whose way is off by more",
-        "than two of the stated sigma, the camera's share in it; *standstill* are images that say so while the car",
-        "drives, *outside* valid ones with a speed that the car cannot have had. All variants of a film are driven by",
-        "one camera file (`perf/film_cameras`). *Noise* adds 1.5 grey to each pixel, drawn again, and changes nothing",
-        "else: by as much differ the metres of any two films that a driver would call the same.",
+        "Consistency of the scale of each recording at other sizes and rates, with H.264, with obstructions, and with",
+        "later starts (`python -m perf films`). Valid frames and speed count after the first 2 s; *over* is the ratio",
+        "of speed to that of the unchanged film, the median over seconds; *deviation* is the median absolute deviation",
+        "of the ratio of speed to truth. `town`: the truth is GPS at 1 Hz, in whole km/h; its lens is unknown, so a",
+        "constant factor is due to its focal length and height. `town_72` uses the field of view that matches GPS",
+        "instead of the stated 60 degrees. For `rain` only bounds of the speed are known, 15 to 35 m/s. *Beyond* are",
+        "seconds with a distance error over two stated sigma, including the camera's; *standstill* are images with",
+        "this status while the car moves, *outside* valid ones with an impossible speed. All variants of a film use",
+        "one camera file (`perf/film_cameras`). *Noise* adds 1.5 grey levels of noise to each pixel: smaller differences",
+        "between variants are not significant.",
     ]
     for part in dict.fromkeys(row["part"] for row in rows):
         chosen = [row for row in rows if row["part"] == part]
@@ -182,7 +180,7 @@ def page(rows: list[dict[str, Any]]) -> str:
 
 
 def _spread(rows: list[dict[str, Any]]) -> list[str]:
-    """For each film the least and the most of its variants, over the unchanged one."""
+    """For each film the range of its variants relative to the unchanged one."""
     out = []
     for film in dict.fromkeys(row["film"] for row in rows):
         ratios = [row["way_over_unchanged"] for row in rows if row["film"] == film]
@@ -195,7 +193,7 @@ def _spread(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def draw(rows: list[dict[str, Any]], path: Path) -> None:
-    """Speed over truth by seconds, a panel for each part of each film."""
+    """Draws speed over truth by seconds, a panel per part and film."""
     panels = list(dict.fromkeys((row["film"], row["part"]) for row in rows))
     figure, axes = plt.subplots(len(panels), 1, figsize=(10, 2.6 * len(panels)), squeeze=False)
     for (film, part), panel in zip(panels, axes[:, 0], strict=True):

@@ -1,4 +1,4 @@
-"""What is done to a film before it is driven: another size, rate or compression, and what is in the camera's way."""
+"""Variants of a film: other sizes, rates and compressions, and obstructions in front of the camera."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from birdslam.geometry.camera import Camera
 from birdslam.world.windscreen import from_share
 
 Timed = tuple[int, Image]  # t_source_ns, the raw image
-Change = Callable[[int, Image], Image]  # of an image's index and the image
+Change = Callable[[int, Image], Image]  # (index of an image, image)
 
 MIN_WIDTH_PX, MAX_WIDTH_PX = 320, 3840
 _ENCODER = "libx264"
@@ -25,18 +25,18 @@ _ENCODER = "libx264"
 
 @dataclass(frozen=True)
 class Variant:
-    """How a film differs from the one at hand."""
+    """The differences to the original film."""
 
     name: str
     size: float = 1.0
-    every: int = 1  # each n-th image alone
-    repeats: int = 1  # how often each image comes, as films of another rate have it
-    interlaced: bool = False  # every second row is that of the film's next image
+    every: int = 1  # use only each n-th image
+    repeats: int = 1  # copies of each image, as in films converted to another rate
+    interlaced: bool = False  # every second row is from the next image
     crf: int | None = None  # of H.264: 18 is fine, 35 coarse
     shown: Change | None = None
 
     def camera(self, camera: Camera) -> Camera:
-        """The camera whose images these are; `camera` is that of the film at hand."""
+        """The camera of the changed images; `camera` is that of the original film."""
         if self.size == 1.0:
             return camera
         width_px, height_px = (round(side * self.size) for side in (camera.width_px, camera.height_px))
@@ -52,17 +52,17 @@ class Variant:
         )
 
     def fits(self, camera: Camera) -> bool:
-        """Whether films have such a width."""
+        """Whether the width is within the supported range."""
         return MIN_WIDTH_PX <= camera.width_px * self.size <= MAX_WIDTH_PX
 
     def images(self, film: Iterator[Timed], folder: Path) -> Iterator[Timed]:
-        """The film's images so changed; `folder` takes what is encoded."""
+        """The changed images of a film; `folder` is for encoded files."""
         yield from _encoded(self._repeated(self._resized(_woven(film) if self.interlaced else film)), self.crf, folder)
 
     def _repeated(self, film: Iterator[Timed]) -> Iterator[Timed]:
         before: Timed | None = None
         for t_ns, image in film:
-            if before is not None:  # each repetition between an image and the next
+            if before is not None:  # repetitions are between an image and the next
                 for repeat in range(1, self.repeats):
                     yield before[0] + repeat * (t_ns - before[0]) // self.repeats, before[1]
             before = t_ns, image
@@ -83,13 +83,13 @@ class Variant:
 
 PARTS = ("starts", "sizes", "noise", "compression", "view")
 _SIZES, _EVERY = (1.0, 0.5, 0.75, 2.0), (1, 2, 3)
-_NOISE_GREY, _DRAWS = 1.5, 5  # 1-sigma: no eye sees it
+_NOISE_GREY, _DRAWS = 1.5, 5  # 1-sigma of invisible noise; number of draws
 _USUAL_CRF = 23
 _DIRT_SEED = 1
 
 
 def variants(camera: Camera, part: str) -> list[Variant]:
-    """Those of a part of PARTS for a film of this camera, the unchanged one first."""
+    """The variants of a part of PARTS for a film of this camera, the unchanged one first."""
     every = {
         "starts": [_other(1.0, 1), _other(0.5, 1), _other(1.0, 2), _other(1.0, 3)],
         "sizes": [_other(size, n) for size in _SIZES for n in _EVERY],
@@ -115,7 +115,7 @@ def _other(size: float, every: int) -> Variant:
 
 
 def _woven(film: Iterator[Timed]) -> Iterator[Timed]:
-    """Half images of two times in each, as interlaced cameras store them; the last image is left over."""
+    """Interlaced images: rows of two times in each; drops the last image."""
     first: Timed | None = None
     for t_ns, image in film:
         if first is not None:
@@ -126,11 +126,11 @@ def _woven(film: Iterator[Timed]) -> Iterator[Timed]:
 
 
 def _encoded(film: Iterator[Timed], crf: int | None, folder: Path) -> Iterator[Timed]:
-    """The film through an encoder and a decoder, in times of its own."""
+    """The film encoded and decoded, with its own times."""
     if crf is None:
         yield from film
         return
-    import av  # only here: nothing else needs an encoder
+    import av  # imported late: only needed here
 
     path = folder / "encoded.mp4"
     times_ns: list[tuple[int, tuple[int, int]]] = []
@@ -154,7 +154,7 @@ def _encoded(film: Iterator[Timed], crf: int | None, folder: Path) -> Iterator[T
 
 
 def _noise(draw: int) -> Change:
-    """Noise that no eye sees: by how much metres differ then, other differences say nothing."""
+    """Invisible noise; the resulting differences are the significance threshold of all others."""
 
     def noisy(index: int, image: Image) -> Image:
         added = np.random.default_rng((draw, index)).normal(0.0, _NOISE_GREY, image.shape)
@@ -163,11 +163,11 @@ def _noise(draw: int) -> Change:
     return noisy
 
 
-# --- what is in the way ---
+# --- obstructions ---
 
 
 def _caption(index: int, image: Image) -> Image:
-    """Place and time along the lower edge, as dashboard cameras write them."""
+    """Position and time along the lower edge, as dashboard cameras write them."""
     out = image.copy()
     rows, columns = out.shape[:2]
     text = f"CAMERA 2020-01-01 12:{index // 1800:02d}:{index // 30 % 60:02d}  51.0000 -114.0000"
@@ -177,13 +177,13 @@ def _caption(index: int, image: Image) -> Image:
 
 
 def _dirt() -> Change:
-    """Spots on the windscreen, each time the same."""
+    """Fixed spots on the windscreen."""
     edit = from_share("dirt", _DIRT_SEED, 0.0)
     return lambda index, image: edit(index, 1, image)
 
 
 def _bonnet(_: int, image: Image) -> Image:
-    """A dark bonnet in the lowest eighth, with an edge as bright as the sky in it."""
+    """A dark bonnet in the lowest eighth, with an edge that reflects the sky."""
     out = image.copy()
     rows, columns = out.shape[:2]
     centre, axes = (columns // 2, round(1.25 * rows)), (round(0.7 * columns), round(0.38 * rows))
@@ -193,6 +193,6 @@ def _bonnet(_: int, image: Image) -> Image:
 
 
 def _flicker(index: int, image: Image) -> Image:
-    """Lamps of 100 Hz before a camera of 30 Hz, or an exposure that hunts."""
+    """Brightness flicker, as from 100 Hz lamps at 30 Hz or an unstable exposure."""
     gain = 1.0 + 0.12 * np.sin(2.0 * np.pi * index / 3.0)
     return np.asarray(np.clip(image * gain, 0, 255), np.uint8)

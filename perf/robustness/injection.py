@@ -1,4 +1,4 @@
-"""The faults of the fault suite, each a context manager: the fault lasts as long as the context."""
+"""The faults of the fault suite, each a context manager that lasts as long as the fault."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ from birdslam.runtime.transport.presence import ring_path
 
 Injection = Callable[[Vehicle], contextlib.AbstractContextManager[None]]
 
-PROMISE_S = {"capture": 1.0, "perceive": 2.0, "optimize": 1.0}  # to a valid estimate after kill -9
+PROMISE_S = {"capture": 1.0, "perceive": 2.0, "optimize": 1.0}  # max. time to a valid estimate after kill -9
 READERS = {"frame": "perceive", "measurements": "optimize", "estimate": "planner"}
 
 
 @dataclass(frozen=True)
 class Fault:
-    """`inject` is a context: the fault goes on inside it, for `lasts_s`."""
+    """`inject` is the context of the fault, which lasts `lasts_s`."""
 
     name: str
     node: str
     inject: Injection
     lasts_s: float = 0.0
-    blind: bool = False  # nothing captured meanwhile may be valid
+    blind: bool = False  # no frame captured during the fault may be valid
     promise_s: float | None = None
 
 
 def signalled(node: str, number: signal.Signals, then: signal.Signals | None = None) -> Injection:
-    """A signal to the process of a node, and another one when it is over."""
+    """A signal to the process of a node, and optionally another at the end."""
 
     @contextlib.contextmanager
     def inject(vehicle: Vehicle) -> Iterator[None]:
@@ -52,7 +52,7 @@ def signalled(node: str, number: signal.Signals, then: signal.Signals | None = N
 
 
 def camera(name: str) -> Injection:
-    """The camera does this meanwhile (perf/faulty_camera)."""
+    """A fault of the camera (perf/faulty_camera)."""
 
     @contextlib.contextmanager
     def inject(vehicle: Vehicle) -> Iterator[None]:
@@ -71,7 +71,7 @@ def cpu_hog(vehicle: Vehicle) -> Iterator[None]:
 
 
 def no_memory(node: str) -> Injection:
-    """No further page: the process has what it has."""
+    """The process can't allocate more memory."""
 
     @contextlib.contextmanager
     def inject(vehicle: Vehicle) -> Iterator[None]:
@@ -84,14 +84,14 @@ def no_memory(node: str) -> Injection:
 
 
 def full_disk(node: str) -> Injection:
-    """No file of the process's grows any more."""
+    """The process can't extend files."""
 
     @contextlib.contextmanager
     def inject(vehicle: Vehicle) -> Iterator[None]:
         process = vehicle.node(node)
         resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (1, resource.RLIM_INFINITY))
         yield
-        with contextlib.suppress(ProcessLookupError):  # the recorder ends of it
+        with contextlib.suppress(ProcessLookupError):  # the recorder ends by itself
             resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
 
     return inject
@@ -99,7 +99,7 @@ def full_disk(node: str) -> Injection:
 
 @contextlib.contextmanager
 def _beside(program: str, *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
-    """Another process, from when it says that it is at work until the end of the fault."""
+    """Another process, from its message "at work" until the end of the fault."""
     process = subprocess.Popen(
         [sys.executable, "-c", program, *arguments], stdout=subprocess.PIPE, env={**os.environ, "PYTHONPATH": str(ROOT)}
     )
@@ -132,7 +132,7 @@ with Bus("faults", "intruder", runtime_dir=Path(sys.argv[1])) as bus:
 
 
 def intruder(topic: str, size: int, count: int) -> Injection:
-    """Random bytes on a topic of the bus, as a program of the vehicle's own user could send them."""
+    """Random bytes on a topic of the bus, from a program of the same user."""
 
     @contextlib.contextmanager
     def inject(vehicle: Vehicle) -> Iterator[None]:
@@ -160,7 +160,7 @@ with Bus("faults", "asker", runtime_dir=Path(sys.argv[1])) as bus:
 
 @contextlib.contextmanager
 def queries(vehicle: Vehicle) -> Iterator[None]:
-    """A program that asks for everything, without a pause."""
+    """A program that sends all queries without pause."""
     keys = ",".join(key_of(vehicle.vehicle, name) for name in (*QUERIES, "estimate", "measurements"))
     with _beside(_ASKER, str(vehicle.runtime_dir), keys):
         yield
@@ -182,7 +182,7 @@ while True:
 
 @contextlib.contextmanager
 def scribbler(vehicle: Vehicle) -> Iterator[None]:
-    """Random bytes into the frames in shared memory, while they are written and read."""
+    """Random bytes in the shared memory of the frames, while they are written and read."""
     with _beside(_SCRIBBLER, str(ring_path(vehicle.vehicle, vehicle.runtime_dir))):
         yield
 
@@ -201,7 +201,7 @@ with Planner("faults", Path(sys.argv[1])) as planner:
 
 @contextlib.contextmanager
 def slow_planner(vehicle: Vehicle) -> Iterator[None]:
-    """Another planner that stops reading altogether."""
+    """Another planner that stops reading."""
     with _beside(_SLOW, str(vehicle.runtime_dir)) as slow:
         slow.send_signal(signal.SIGSTOP)
         yield
@@ -209,7 +209,7 @@ def slow_planner(vehicle: Vehicle) -> Iterator[None]:
 
 @contextlib.contextmanager
 def kill_everything(vehicle: Vehicle) -> Iterator[None]:
-    """Then a second start over the files that the first left."""
+    """Kills all processes and starts again with the files left behind."""
     everybody = [psutil.Process(vehicle.process.pid), *psutil.Process(vehicle.process.pid).children()]
     for process in everybody:
         process.kill()
@@ -241,7 +241,7 @@ def _faults() -> Iterator[Fault]:
     yield Fault("flood of queries, 2 s", "supervisor", queries, lasts_s=2.0)
     yield Fault("a planner that stands still", "planner", slow_planner, lasts_s=3.0)
     yield Fault("kill -9 of everything, second start", "all", kill_everything)
-    # The last ones: the recording, then the run's results stay incomplete
+    # These come last: they leave the recording and the run's results incomplete
     for node in ("record", "supervisor"):
         yield Fault("full disk", node, full_disk(node), lasts_s=2.0)
 

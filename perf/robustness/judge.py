@@ -1,4 +1,4 @@
-"""What a planner receives of a vehicle under faults, compared with where the car really was."""
+"""Compares the estimates that a planner receives during faults with the truth."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ import numpy as np
 
 from birdslam.types import INVALIDATING, Estimate, Status
 
-# A pose is wrong where it is farther from the truth than this, since the first valid one of its epoch:
-SIGMAS = 3.0  # of its own covariance, and
-PATH_SHARE = 0.05  # of the way (undisturbed the odometry errs by up to 2 % on the software camera's coarse image), and
-TRUTH_FRAMES = 2.0  # to which the truth is known, one frame at each end
-YAW_RAD = 0.05  # or turned by more, beside the same sigmas
+# A pose is wrong if its error since the first valid pose of its epoch exceeds the sum of these:
+SIGMAS = 3.0  # of its covariance
+PATH_SHARE = 0.05  # of the distance; undisturbed odometry on the software camera errs by up to 2 %
+TRUTH_FRAMES = 2.0  # uncertainty of the truth, one frame at each end
+YAW_RAD = 0.05  # max. error of the yaw beside the sigmas
 SEEN_STATUSES = 6
 
 
 class Judge:
-    """Takes what comes to the planner; `truth_m` says how far the car had come when a frame was captured."""
+    """Evaluates the planner's estimates; `truth_m` gives the true position at a frame's capture."""
 
     def __init__(self, truth_m: Callable[[int], float], frame_m: float) -> None:
         self._truth_m, self._frame_m = truth_m, frame_m
         self.estimates: list[tuple[int, Estimate]] = []  # received (CLOCK_MONOTONIC ns)
         self.silent_ms = 0.0  # longest silence
-        self.wrong = 0  # poses that were marked valid and were not where the car was
-        self.error_m = 0.0  # the largest of one marked valid
-        self.backwards = 0  # frame numbers that fell
-        self._anchors: dict[int, Estimate] = {}  # by epoch, the first valid estimate that was measured
+        self.wrong = 0  # wrong poses that were marked valid
+        self.error_m = 0.0  # largest error of a pose marked valid
+        self.backwards = 0  # count of falling frame numbers
+        self._anchors: dict[int, Estimate] = {}  # by epoch, the first valid measured estimate
         self._last_ns = time.monotonic_ns()
 
     def see(self, estimate: Estimate | None) -> None:
-        """What the planner has just got; None: nothing for a moment."""
+        """Takes the planner's next estimate; None: none for a moment."""
         now_ns = time.monotonic_ns()
         self.silent_ms = max(self.silent_ms, (now_ns - self._last_ns) / 1e6)
         if estimate is None:
@@ -59,8 +59,10 @@ class Judge:
         self.error_m = max(self.error_m, error_m)
 
     def wrongly_valid(self, blind: tuple[int, int] | None) -> int:
-        """Estimates marked valid that can't be: by their own status, by numbers that are none, or captured while the
-        camera showed nothing. Where the car was is `wrong`."""
+        """Number of estimates marked valid despite their status, invalid numbers, or a blind camera.
+
+        Wrong positions are counted in `wrong`.
+        """
         wrong = 0
         for _, estimate in self.estimates:
             contradicts = not INVALIDATING.isdisjoint(estimate.status)
@@ -69,7 +71,7 @@ class Judge:
         return wrong
 
     def summary(self) -> str:
-        """For the table."""
+        """The text for the table."""
         invalid = sum(not estimate.valid for _, estimate in self.estimates)
         statuses = Counter(status.value for _, estimate in self.estimates for status in estimate.status)
         epochs = {estimate.epoch for _, estimate in self.estimates}

@@ -1,11 +1,10 @@
-"""A long drive: what memory, descriptors and age of every process gain in an hour, with its sigma; watchdogs, drops.
+"""A long drive: growth of memory, descriptors and age per hour with its sigma; watchdogs and drops.
 
     python -m perf soak [--minutes 30] [--rate 33] [--source demo] [--map] [--record] [--models DIR] [...]
 
-Further options are those of `birdslam run`; without `--source` the software camera of the fault suite drives down its
-street. Ends with status 1, and says why, where after the first minute a process grew by more than 1 %, or would in
-eight hours by what its second half gained (beyond 3 sigma), held more descriptors, was restarted or missed a watchdog
-(the soak stands in systemd's place), or estimates came later.
+Other options are those of `birdslam run`; the default source is the fault suite's software camera. Exits with 1 if
+after the first minute a process grew by over 1 %, would do so in eight hours at the rate of the second half (beyond 3
+sigma), held more descriptors, restarted or missed a watchdog, or if the age of estimates grew. Replaces systemd.
 """
 
 from __future__ import annotations
@@ -39,12 +38,12 @@ from birdslam.runtime.transport.closing import Closing
 label = "memory, descriptors, watchdogs and drops of every process over a long drive"
 
 MAP_FILE = "soak.map"
-WARM_S, SAMPLE_S, SAID_S = 60.0, 5.0, 30.0
-SPAN = 6  # samples at either end whose medians are compared: what a process holds swings by its garbage
+WARM_S, SAMPLE_S, PRINT_S = 60.0, 5.0, 30.0
+SPAN = 6  # samples at either end whose medians are compared, to average garbage collection
 GROWTH = 0.01
-SHIFT_H = 8.0  # of driving, to which the second half is carried on: by then what a start makes once is made
-SIGMAS = 3.0  # of that growth, before it counts as one: eight processes, each a chance
-AGE_GROWTH = 0.1  # of the age's median, first quarter to last
+SHIFT_H = 8.0  # duration for the extrapolation of the second half
+SIGMAS = 3.0  # min. significance of growth
+AGE_GROWTH = 0.1  # max. growth of the median age, first to last quarter
 WATCHDOG_S = 5.0  # of the supervisor, as in deploy/birdslam.service
 
 
@@ -61,7 +60,7 @@ class Systemd(Closing):
 
     @property
     def environment(self) -> dict[str, str]:
-        """That the supervisor is started with."""
+        """Environment variables of the supervisor."""
         return {"NOTIFY_SOCKET": self._address, "WATCHDOG_USEC": str(round(WATCHDOG_S * 1e6))}
 
     def _listen(self) -> None:
@@ -85,7 +84,7 @@ class Systemd(Closing):
 
 @dataclass
 class Series:
-    """One process, sample by sample from the end of the first minute on."""
+    """Samples of one process after the first minute."""
 
     t_s: list[float] = field(default_factory=list)
     mib: list[float] = field(default_factory=list)
@@ -93,7 +92,7 @@ class Series:
     pids: set[int] = field(default_factory=set)
 
     def ends(self) -> tuple[float, float]:
-        """Resident memory (MiB) at the beginning and at the end."""
+        """Resident memory (MiB) at start and end."""
         span = max(1, min(SPAN, len(self.mib) // 2))
         return float(np.median(self.mib[:span])), float(np.median(self.mib[-span:]))
 
@@ -103,33 +102,33 @@ class Series:
         return after / before - 1.0
 
     def in_a_shift(self) -> tuple[float, float]:
-        """By what share it would grow in SHIFT_H as in its second half, and the sigma; NaN: too short to tell."""
+        """Relative growth in SHIFT_H at the rate of the second half, and its sigma; NaN if the series is too short."""
         half = len(self.mib) // 2
         gain, sigma = drift(self.t_s[half:], self.mib[half:])
         return gain * SHIFT_H / self.mib[0], sigma * SHIFT_H / self.mib[0]
 
     @property
     def leaked(self) -> int:
-        """Descriptors that it holds at the end and did not at the beginning."""
+        """Growth of the number of descriptors from start to end."""
         span = max(1, min(SPAN, len(self.descriptors) // 2))
         return min(self.descriptors[-span:]) - max(self.descriptors[:span])
 
 
 @dataclass
 class Ages:
-    """Of estimates at the planner, from the end of the first minute on."""
+    """Ages of estimates at the planner after the first minute."""
 
     t_s: list[float] = field(default_factory=list)
     ms: list[float] = field(default_factory=list)
-    begin_ns: int = 0  # the source's time of the first one, and how far it is from there
+    begin_ns: int = 0  # source time of the first one
     driven_ns: int = 0
 
 
 def slope(t_s: ArrayLike, values: ArrayLike, of: Callable[[Floats], float] = np.mean) -> tuple[float, float]:
-    """What a series gains in an hour, and the sigma of that; NaN where it is too short to tell.
+    """Slope of a series per hour, and its sigma; NaN if the series is too short.
 
-    A line through blocks of the series, each by its mean or what else stands for it: samples that follow each other are
-    not independent, blocks nearly are. The sigma is by what the blocks are off that line.
+    Fits a line through the means (or another statistic) of blocks, which are nearly independent, unlike samples. The
+    sigma follows from the residuals of the blocks.
     """
     t, y = np.asarray(t_s, dtype=np.float64) / 3600.0, np.asarray(values, dtype=np.float64)
     if t.size < 2 * BLOCKS:
@@ -143,10 +142,9 @@ def slope(t_s: ArrayLike, values: ArrayLike, of: Callable[[Floats], float] = np.
 
 
 def drift(t_s: ArrayLike, values: ArrayLike) -> tuple[float, float]:
-    """What a series that keeps what it gains will gain in an hour, and the sigma of that; NaN: it is too short to tell.
+    """Growth per hour of a series that rises in steps, such as memory, and its sigma; NaN if the series is too short.
 
-    Memory goes up in steps and stays there: what each block of it gains is independent, what it is off a line is not.
-    So one step, of a table that doubles or of more images at once than ever before, is one sigma.
+    The gains of blocks are independent, residuals of a line are not. A single step is one sigma.
     """
     t, y = np.asarray(t_s, dtype=np.float64) / 3600.0, np.asarray(values, dtype=np.float64)
     if t.size < 2 * BLOCKS:
@@ -157,7 +155,7 @@ def drift(t_s: ArrayLike, values: ArrayLike) -> tuple[float, float]:
 
 
 def sample(processes: Mapping[str, psutil.Process], into: Mapping[str, Series]) -> None:
-    """Adds what each process holds now."""
+    """Adds a sample of each process."""
     for name, process in processes.items():
         with contextlib.suppress(psutil.NoSuchProcess), process.oneshot():
             into[name].t_s.append(time.monotonic())
@@ -167,7 +165,7 @@ def sample(processes: Mapping[str, psutil.Process], into: Mapping[str, Series]) 
 
 
 def faults(series: Mapping[str, Series], summary: dict[str, Any], systemd: Systemd) -> Iterator[str]:
-    """What a soak must not show, a line each."""
+    """Yields a line for each failed check."""
     for name, one in series.items():
         if one.growth > GROWTH:
             yield f"{name} grew by {one.growth:.1%}"
@@ -175,9 +173,9 @@ def faults(series: Mapping[str, Series], summary: dict[str, Any], systemd: Syste
         if gain - SIGMAS * sigma > GROWTH:
             yield f"{name} would grow by {gain:.1%} +- {sigma:.1%} in {SHIFT_H:g} hours"
         if one.leaked > 0:
-            yield f"{name} holds {one.leaked} descriptors more"
+            yield f"{name} holds {one.leaked} more descriptors"
         if len(one.pids) > 1:
-            yield f"{name} was {len(one.pids)} processes, one after the other"
+            yield f"{name} ran as {len(one.pids)} successive processes"
     for name, count in restarts(summary).items():
         if count:
             yield f"{name} was restarted {count} times"
@@ -186,37 +184,37 @@ def faults(series: Mapping[str, Series], summary: dict[str, Any], systemd: Syste
 
 
 def ages(found: Ages) -> tuple[str, list[str]]:
-    """Of estimates after the first minute: p50 and p99 in the first and the last quarter, and what is not well."""
+    """Text with p50 and p99 of the estimates' ages in the first and last quarter, and failed checks."""
     quarter = max(1, len(found.ms) // 4)
     p50, p99 = np.percentile(found.ms[:quarter], (50, 99))
     end_p50, end_p99 = np.percentile(found.ms[-quarter:], (50, 99))
-    said = f"age at the planner, first quarter p50 {p50:.1f}, p99 {p99:.1f} ms; last {end_p50:.1f}, {end_p99:.1f} ms"
+    text = f"age at the planner, first quarter p50 {p50:.1f}, p99 {p99:.1f} ms; last {end_p50:.1f}, {end_p99:.1f} ms"
     for percent in (50, 99):
         gain, sigma = slope(found.t_s, found.ms, partial(np.percentile, q=percent))
-        said += f"; p{percent} {gain:+.1f} +- {sigma:.1f} ms an hour"
+        text += f"; p{percent} {gain:+.1f} +- {sigma:.1f} ms an hour"
     grew = end_p50 > (1.0 + AGE_GROWTH) * p50
-    return said, [f"the age grew from {p50:.1f} to {end_p50:.1f} ms in the median"] if grew else []
+    return text, [f"the median age grew from {p50:.1f} to {end_p50:.1f} ms"] if grew else []
 
 
 def keyframes_in(file: Path) -> int:
-    """Of the map as it was last saved.
+    """Number of keyframes in the map as last saved.
 
-    A recording that goes round is a new street to it each time, since the car is elsewhere at once.
+    A looped recording adds a new street each time, since the position jumps.
     """
     try:
         return len(read_map(file))
-    except MapError:  # none was saved yet
+    except MapError:  # not saved yet
         return 0
 
 
 def restarts(summary: dict[str, Any]) -> dict[str, int]:
-    """Of each node, and of the recorder where there is one: dead, or ended by its watchdog."""
+    """Restarts of each node, and of the recorder if there is one, after a crash or a watchdog."""
     recorder = {"record": summary["recording"]["restarts"]} if "recording" in summary else {}
     return {**summary["restarts"], **recorder}
 
 
 def table(series: Mapping[str, Series], summary: dict[str, Any], systemd: Systemd) -> str:
-    """For a person."""
+    """The results as a table."""
     begun_anew = restarts(summary) | {"supervisor": systemd.missed}
     dropped = summary["dropped_by"] | {"record": summary.get("recording", {}).get("dropped", 0)}
     columns = (
@@ -238,9 +236,9 @@ def table(series: Mapping[str, Series], summary: dict[str, Any], systemd: System
 
 
 def drive(vehicle: Vehicle, minutes: float) -> tuple[dict[str, Series], Ages]:
-    """Samples until the time is over, and the ages of estimates; both after the first minute.
+    """Samples of the processes and ages of estimates, both after the first minute.
 
-    Raises RuntimeError where the run ends before.
+    Raises RuntimeError if the run ends early.
     """
     begun_s = time.monotonic()
     until_s = begun_s + max(60.0 * minutes, WARM_S + 2 * SAMPLE_S)
@@ -257,28 +255,30 @@ def drive(vehicle: Vehicle, minutes: float) -> tuple[dict[str, Series], Ages]:
             found.t_s.append(now_s)
             found.ms.append((time.monotonic_ns() - estimate.t_capture_ns) / 1e6)
         if vehicle.process.poll() is not None:
-            raise RuntimeError(f"the run has ended by itself: {(vehicle.place / 'run.log').read_text()[-1000:]}")
+            raise RuntimeError(f"the run ended early: {(vehicle.place / 'run.log').read_text()[-1000:]}")
         if now_s >= due_s:
             keyframes = keyframes if series else keyframes_in(map_file)
             due_s += SAMPLE_S
             sample(vehicle.processes(), series)
-        if now_s >= said_s + SAID_S:
-            said_s += SAID_S
+        if now_s >= said_s + PRINT_S:
+            said_s += PRINT_S
             held = ", ".join(f"{name} {one.mib[-1]:.1f} ({one.growth:+.2%})" for name, one in series.items())
             print(f"{(now_s - begun_s) / 60.0:5.1f} min  {frames} estimates  {held or 'warming up'}", flush=True)
-    if keyframes:  # one comes into the file within ten seconds or so
+    if keyframes:  # written to the file within about ten seconds
         print(f"map: {keyframes} keyframes after the first minute, {keyframes_in(map_file)} at the end")
     return dict(series), found
 
 
 def run(arguments: list[str]) -> int:
-    """Gives the exit status."""
+    """Returns the exit status."""
     parser = benchmark_parser("soak", label, output="")
     parser.add_argument("--minutes", type=float, default=30.0)
-    parser.add_argument("--rate", type=float, default=33.0, metavar="HZ", help="above the recording's: faster")
-    parser.add_argument("--source", default="", metavar="URI", help="goes round and round; left out: a software camera")
-    parser.add_argument("--map", action="store_true", help="localised in a map that it makes")
-    parser.add_argument("--record", action="store_true", help="with a recorder beside it")
+    parser.add_argument(
+        "--rate", type=float, default=33.0, metavar="HZ", help="of playback; above the recording's rate: faster"
+    )
+    parser.add_argument("--source", default="", metavar="URI", help="played in a loop; default: the software camera")
+    parser.add_argument("--map", action="store_true", help="build a map and localize in it")
+    parser.add_argument("--record", action="store_true", help="run a recorder too")
     parser.add_argument("--models", type=Path, help="folder of networks")
     options, more = parser.parse_known_args(arguments)
     ends_with_its_vehicle()
@@ -298,12 +298,10 @@ def run(arguments: list[str]) -> int:
     )
     print(f"longest silence of the supervisor's watchdog: {systemd.longest_s:.1f} s of {WATCHDOG_S:g}")
     driven_h = found_ages.driven_ns / 3.6e12
-    print(
-        f"driven: {driven_h:.3f} h of the source's time, {60.0 * driven_h / options.minutes:.2f} times as fast as it is"
-    )
-    said, late = ages(found_ages)
-    print(said)
+    print(f"driven: {driven_h:.3f} h of the source's time, {60.0 * driven_h / options.minutes:.2f} times real time")
+    text, late = ages(found_ages)
+    print(text)
     found = [*faults(series, summary, systemd), *late, *([f"the run ended with status {status}"] if status else [])]
     for line in found:
-        print(f"NOT WELL: {line}")
+        print(f"FAILED: {line}")
     return int(bool(found))
