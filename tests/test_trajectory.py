@@ -129,8 +129,8 @@ def test_the_identity_has_no_negative_zeros() -> None:
         ("1 2 3\n", "line 1"),
         (kitti_row(np.eye(4)) + "\n" + kitti_row(np.eye(4)).replace("1.0", "nan", 1) + "\n", "line 2"),
         ("a " * 12, "line 1"),
-        (kitti_row(2.0 * np.eye(4)), "pose 0 holds no rotation"),
-        (kitti_row(np.diag([1.0, 1.0, -1.0, 1.0])), "pose 0 holds no rotation"),
+        (kitti_row(2.0 * np.eye(4)), "pose 0 has no valid rotation"),
+        (kitti_row(np.diag([1.0, 1.0, -1.0, 1.0])), "pose 0 has no valid rotation"),
     ],
 )
 def test_a_torn_pose_file_is_named(tmp_path: Path, text: str, what: str) -> None:
@@ -145,7 +145,7 @@ def test_missing_and_binary_pose_files_are_named(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"none\.txt: can't be read"):
         read_kitti(tmp_path / "none.txt")
     (tmp_path / "b.txt").write_bytes(bytes(range(256)))
-    with pytest.raises(ValueError, match=r"b\.txt: is no text file"):
+    with pytest.raises(ValueError, match=r"b\.txt: is not a text file"):
         read_tum(tmp_path / "b.txt")
     (tmp_path / "c.txt").write_text("0 0 0 0 0 0 0 0\n")
     with pytest.raises(ValueError, match="unit quaternion"):

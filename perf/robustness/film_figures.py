@@ -156,8 +156,8 @@ def page(rows: list[dict[str, Any]]) -> str:
         "instead of the stated 60 degrees. For `rain` only bounds of the speed are known, 15 to 35 m/s. *Beyond* are",
         "seconds with a distance error over two stated sigma, including the camera's; *standstill* are images with",
         "this status while the car moves, *outside* valid ones with an impossible speed. All variants of a film use",
-        "one camera file (`perf/film_cameras`). *Noise* adds 1.5 grey levels of noise to each pixel: smaller differences",
-        "between variants are not significant.",
+        "one camera file (`perf/film_cameras`). *Noise* adds noise of 1.5 grey levels to each pixel: smaller",
+        "differences between variants are not significant.",
     ]
     for part in dict.fromkeys(row["part"] for row in rows):
         chosen = [row for row in rows if row["part"] == part]

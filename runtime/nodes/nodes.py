@@ -201,7 +201,7 @@ class PerceiveNode:
         """Does nothing: perceive ends with END_OF_SOURCE."""
 
     def counters(self) -> dict[str, int]:
-        frames, looks = self._frames, self._inference.networks.looks
+        frames, looks = self._frames, self._inference.networks.frames_with_start
         return {"dropped": frames.dropped, "malformed": frames.malformed, "torn": self._torn, "looks": looks}
 
     def close(self) -> None:
