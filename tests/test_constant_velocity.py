@@ -1,4 +1,4 @@
-"""Where the images show no translation: the speed is held, its sigma grows, and the road's return is used at once."""
+"""The velocity prior: without observable translation the speed is held with a growing sigma."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def _length_m(motion: Motion) -> float:
     return float(np.linalg.norm(motion.t_prev_curr_m)) / (motion.to_frame - motion.from_frame)
 
 
-def test_the_speed_is_held_with_a_growing_sigma(blinded: list[Motion]) -> None:
+def test_speed_is_held_with_growing_sigma(blinded: list[Motion]) -> None:
     blind = [m for m in blinded if BEFORE <= m.to_frame < BEFORE + HIDDEN]
     assert not any(m.standstill for m in blind)
     for m in blind:
@@ -48,7 +48,7 @@ def test_the_speed_is_held_with_a_growing_sigma(blinded: list[Motion]) -> None:
     assert sigma[-1] > 3.0 * blinded[BEFORE - 2].scale_sigma_rel
 
 
-def test_it_is_told_as_carried_and_then_as_invalid(blinded: list[Motion]) -> None:
+def test_scale_is_reported_as_carried_then_invalid(blinded: list[Motion]) -> None:
     blind = [set(m.status) for m in blinded if BEFORE <= m.to_frame < BEFORE + HIDDEN]
     told = [status & {Status.SCALE_CARRIED, Status.ODOMETRY_COASTING} for status in blind]
     assert all(told)
@@ -57,7 +57,7 @@ def test_it_is_told_as_carried_and_then_as_invalid(blinded: list[Motion]) -> Non
     assert invalid[-1]
 
 
-def test_the_roads_return_is_used_within_a_second(blinded: list[Motion]) -> None:
+def test_visible_road_is_used_again_within_a_second(blinded: list[Motion]) -> None:
     back = blinded[-1]
     assert not INVALIDATING & set(back.status)
     assert Status.SCALE_CARRIED not in back.status
@@ -84,12 +84,12 @@ def _driven(steps: int = 1, step_m: float = 1.0) -> ConstantVelocityPrior:
     return prior
 
 
-def test_images_that_show_the_way_are_believed() -> None:
+def test_images_with_observable_translation_override_prior() -> None:
     braking = _ahead(0.6)
     assert _driven().fuse(START, braking, np.diag([1e4] * 3 + [1e6] * 3), 0.1, LEVEL) is None
 
 
-def test_without_a_speed_nothing_is_held() -> None:
+def test_without_speed_there_is_no_prior() -> None:
     prior = ConstantVelocityPrior(ConstantVelocityConfig())
     assert prior.fuse(START, _ahead(0.6), np.zeros((6, 6)), 0.1, LEVEL) is None
 
@@ -105,7 +105,7 @@ def _held(prior: ConstantVelocityPrior, measured: Pose, info: np.ndarray, steps:
     return out
 
 
-def test_a_held_step_is_the_last_one_and_its_sigma_grows_by_what_engines_and_brakes_give() -> None:
+def test_held_step_is_the_last_one_with_sigma_from_max_acceleration() -> None:
     """Whoever brakes goes on braking: the speed's sigma grows with the time, at any rate of images."""
     config = ConstantVelocityConfig()
     held = _held(_driven(), _ahead(0.2), NO_LENGTH, 20)
@@ -117,7 +117,7 @@ def test_a_held_step_is_the_last_one_and_its_sigma_grows_by_what_engines_and_bra
     np.testing.assert_allclose([s for _, s in held], 0.1 * config.acceleration_mps2 * lasting, rtol=0.06)
 
 
-def test_a_car_that_brakes_while_images_show_little_is_followed_within_its_sigma() -> None:
+def test_braking_with_weak_images_stays_within_sigma() -> None:
     """They tell its steps to 0.2 m; it brakes by 4 m/s^2, as for a light. Held at one speed it was 2 m/s off in 1 s."""
     prior, step_m = _driven(10), 1.0
     rng = np.random.default_rng(1)
@@ -131,7 +131,7 @@ def test_a_car_that_brakes_while_images_show_little_is_followed_within_its_sigma
         assert abs(got_m - step_m) < 2.5 * found[1]
 
 
-def test_a_held_step_goes_along_the_road_however_the_last_ones_pointed() -> None:
+def test_held_step_follows_the_road_direction() -> None:
     """Corners that are few point anywhere. A direction taken from the step before would wander off with them."""
     aside = _ahead(1.0, right_m=0.1, down_m=0.1)
     pose, _ = _held(_driven(), aside, np.diag([100.0, 100.0, 1.0, 1e8, 1e8, 1e8]), 20)[-1]
@@ -140,7 +140,7 @@ def test_a_held_step_goes_along_the_road_however_the_last_ones_pointed() -> None
     assert abs(down) < 0.01 * ahead
 
 
-def test_a_camera_that_looks_aside_is_held_along_the_way_that_it_was_driven() -> None:
+def test_yawed_camera_keeps_its_direction_of_travel() -> None:
     prior, way = ConstantVelocityPrior(ConstantVelocityConfig()), _ahead(1.0, right_m=-0.03)
     for _ in range(60):
         assert prior.fuse(START, way, CLEAR, 0.1, LEVEL) is None
@@ -149,13 +149,13 @@ def test_a_camera_that_looks_aside_is_held_along_the_way_that_it_was_driven() ->
     assert (START.R.T @ pose.p)[0] == pytest.approx(-0.03, abs=0.005)
 
 
-def test_the_worst_sigma_is_that_of_the_direction_known_worst() -> None:
+def test_worst_sigma_is_that_of_the_least_certain_direction() -> None:
     turn = np.kron(np.eye(2), rotation_exp(np.array([0.2, -0.5, 0.1])))
     info = turn @ np.diag([1e4, 25.0, 1e4, 1e6, 1e6, 1e6]) @ turn.T
     assert largest_sigma_m(info) == pytest.approx(0.2)
 
 
-def test_a_car_that_drives_off_at_33_hz_is_not_held_back() -> None:
+def test_starting_car_at_33_hz_is_not_held_back() -> None:
     """A standing car's speed changes by less within 30 ms than corners show; they are believed all the same."""
     prior = _driven()
     prior.stop()

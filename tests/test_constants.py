@@ -52,7 +52,7 @@ def test_every_key_that_names_a_recording_is_on_the_page() -> None:
     assert {f.key for f in found if RECORDINGS.search(comments(f.struct).get(f.name, ""))} <= names
 
 
-def test_the_page_says_of_the_papers_tables_what_its_rows_say() -> None:
+def test_page_matches_rows_of_the_papers_tables() -> None:
     """What the eleven sequences chose, 0010 and 0018 chose: the row of Tables 1-5 names each."""
     (tables,) = re.findall(r"^\| Tables 1-5 \| .*$", PAGE.read_text(), re.MULTILINE)
     chosen = [name.split(".")[-1] for name, _, data, _ in ROWS if "the eleven sequences" in data]

@@ -1,4 +1,4 @@
-"""Every KITTI layout, built small; what is torn, missing or wrong is named; and the real recordings."""
+"""KITTI layouts built small: torn, missing or wrong files are named; real recordings are read."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def test_clip(tmp_path: Path) -> None:
     assert recording.directory.name == "image_02"
 
 
-def test_what_can_not_be_read_costs_its_frame_only(odometry: Path) -> None:
+def test_unreadable_image_costs_only_its_frame(odometry: Path) -> None:
     images = odometry / "image_0"
     torn = images / "000002.png"
     torn.write_bytes(torn.read_bytes()[:-40])
@@ -162,7 +162,7 @@ def test_what_can_not_be_read_costs_its_frame_only(odometry: Path) -> None:
     assert frames[5].t_source_ns == 1_000_000_000
 
 
-def test_a_jpeg_cut_off_is_unreadable(tmp_path: Path) -> None:
+def test_truncated_jpeg_is_unreadable(tmp_path: Path) -> None:
     write_images(tmp_path / "image_02", range(3), suffix=".jpg")
     (tmp_path / "calib.txt").write_text(f"P2: {P2}\n")
     torn = tmp_path / "image_02" / "000001.jpg"
@@ -171,7 +171,7 @@ def test_a_jpeg_cut_off_is_unreadable(tmp_path: Path) -> None:
     assert [frame.image is None for frame in frames] == [False, True, False]
 
 
-def test_a_sequence_may_begin_at_any_number_and_with_a_torn_image(odometry: Path) -> None:
+def test_sequence_may_start_at_any_number_and_with_a_torn_image(odometry: Path) -> None:
     (odometry / "image_0" / "000000.png").unlink()
     (odometry / "image_0" / "000001.png").write_bytes(b"no image")
     recording, frames = read(odometry)
@@ -243,7 +243,7 @@ def test_a_wrong_calibration_is_named(odometry: Path, calibration: str | None, w
     assert recording.camera is CAMERA
 
 
-def test_a_camera_that_does_not_fit_the_images_is_refused(odometry: Path) -> None:
+def test_camera_of_another_size_is_refused(odometry: Path) -> None:
     with pytest.raises(DatasetError, match="is 64x32, but the given camera is 640x480"):
         open_recording(f"kitti:{odometry}", camera=Camera(640, 480, 500.0, 500.0, 320.0, 240.0, 1.5))
 
@@ -308,7 +308,7 @@ def test_a_video_without_camera_or_of_another_size_is_refused(video: Path, tmp_p
         open_recording(f"video:{tmp_path / 'text.avi'}", camera=CAMERA)
 
 
-def test_a_video_cut_off_ends_with_its_reason(video: Path) -> None:
+def test_truncated_video_ends_with_its_reason(video: Path) -> None:
     data = video.read_bytes()
     video.write_bytes(data[: len(data) * 6 // 10])
     frames = list(open_recording(f"video:{video}", camera=CAMERA).frames())

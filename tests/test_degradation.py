@@ -1,4 +1,4 @@
-"""Degraded modes: what is left out when time is short, and that it returns only with time to spare."""
+"""Degraded modes: load is shed when time is short and restored only with spare time."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ CONFIG = DegradationConfig(window_frames=4, late_share=0.5, calm_frames=6, calm_
 BOTH = ("detector", "segmenter")
 
 
-def test_the_modes_that_make_a_difference() -> None:
+def test_only_modes_that_save_time_are_used() -> None:
     assert modes(BOTH) == tuple(Mode)
     assert modes(("detector",)) == (Mode.FULL, Mode.RATE, Mode.ODOMETRY, Mode.COASTING)
     assert modes(()) == (Mode.FULL, Mode.COASTING)
 
 
-def test_down_step_by_step_and_up_again() -> None:
+def test_modes_degrade_and_recover_step_by_step() -> None:
     degradation = Degradation(CONFIG, BOTH, budget_ms=100.0)
     down = [degradation.mode for _ in range(4 * 6) if degradation.judge(150.0)]
     assert down == list(Mode)[1:]
@@ -52,7 +52,7 @@ def test_down_step_by_step_and_up_again() -> None:
     assert up == list(Mode)[-2::-1]
 
 
-def test_between_calm_and_late_nothing_changes() -> None:
+def test_mode_is_stable_between_thresholds() -> None:
     degradation = Degradation(CONFIG, BOTH, budget_ms=100.0)
     for _ in range(4):
         degradation.judge(150.0)
@@ -61,7 +61,7 @@ def test_between_calm_and_late_nothing_changes() -> None:
 
 
 @given(st.lists(st.floats(0.0, 300.0), max_size=200))
-def test_one_step_at_a_time_and_never_sooner_than_a_window(ages_ms: list[float]) -> None:
+def test_at_most_one_step_per_window(ages_ms: list[float]) -> None:
     degradation = Degradation(CONFIG, BOTH, budget_ms=100.0)
     order = list(Mode)
     last = 0
@@ -132,7 +132,7 @@ def pixels(tmp_path: Path) -> Iterator[dict[str, int]]:
         yield {**place, "height_px": 4, "width_px": 4, "channels": 1}
 
 
-def test_coasting_looks_at_few_frames_and_says_so(tmp_path: Path, pixels: dict[str, int]) -> None:
+def test_coasting_processes_few_frames_and_reports_it(tmp_path: Path, pixels: dict[str, int]) -> None:
     configuration = Configuration(
         vehicle="test",
         runtime=RuntimeConfig(runtime_dir=str(tmp_path)),
@@ -156,7 +156,7 @@ def test_coasting_looks_at_few_frames_and_says_so(tmp_path: Path, pixels: dict[s
     assert all(Status.INPUT_STALE in r.status for r in records if r.frame_id in frontend.shown)
 
 
-def test_a_frame_that_a_newer_one_overtakes_is_predicted(tmp_path: Path, pixels: dict[str, int]) -> None:
+def test_overtaken_frame_is_predicted(tmp_path: Path, pixels: dict[str, int]) -> None:
     runtime = RuntimeConfig(runtime_dir=str(tmp_path))
     configuration = Configuration(vehicle="test", models=ModelsConfig(shipped=False), runtime=runtime)
     stamps = {"t_source_ns": 0, "t_capture_ns": 0, "t_utc_ns": 0}
@@ -176,7 +176,7 @@ def test_a_frame_that_a_newer_one_overtakes_is_predicted(tmp_path: Path, pixels:
     assert node.ended
 
 
-def test_what_runs_aside_runs_where_nothing_is_to_be_left_out(tmp_path: Path, pixels: dict[str, int]) -> None:
+def test_background_work_runs_only_without_degradation(tmp_path: Path, pixels: dict[str, int]) -> None:
     configuration = Configuration(
         vehicle="test",
         models=ModelsConfig(shipped=False),

@@ -1,4 +1,4 @@
-"""The shipped drive: it is whole, its truth is of one piece with its images, and it is read without numba."""
+"""The shipped drive: it is complete, its truth matches its images, and it is read without numba."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def demo() -> DemoRecording:
     return recording
 
 
-def test_it_is_half_a_minute_at_33_hz_under_twelve_megabytes(demo: DemoRecording) -> None:
+def test_drive_is_half_a_minute_at_33_hz_below_12_mb(demo: DemoRecording) -> None:
     assert len(demo) == 1000
     assert demo.rate_hz == pytest.approx(33.0)
     assert sum(path.stat().st_size for path in DIRECTORY.iterdir()) < 12_000_000
@@ -56,7 +56,7 @@ def test_a_stride_keeps_times_and_truth_together() -> None:
     np.testing.assert_array_equal(poses, every[::3])
 
 
-def test_its_motion_is_that_of_a_car(demo: DemoRecording) -> None:
+def test_motion_is_plausible_for_a_car(demo: DemoRecording) -> None:
     poses = demo.truth_poses()
     np.testing.assert_allclose(poses[0], np.eye(4)[:3], atol=1e-9)
     speed = np.linalg.norm(np.diff(poses[:, :, 3], axis=0), axis=1) * demo.rate_hz
@@ -69,7 +69,7 @@ def test_its_motion_is_that_of_a_car(demo: DemoRecording) -> None:
     assert np.ptp(heading) > 0.5  # the bends
 
 
-def test_bodies_stand_where_their_boxes_are(demo: DemoRecording) -> None:
+def test_bodies_project_into_their_boxes(demo: DemoRecording) -> None:
     """A footprint on the road projects into the lower part of its box; hidden bodies are told of, too."""
     checked, hidden = 0, 0
     for index in range(0, 1000, 50):
@@ -96,7 +96,7 @@ def test_a_body_keeps_its_number_and_its_size(demo: DemoRecording) -> None:
 
 
 @pytest.mark.processes
-def test_it_is_read_without_the_renderer() -> None:
+def test_drive_is_read_without_renderer() -> None:
     code = (
         "import sys; sys.modules['numba'] = sys.modules['torch'] = None\n"
         "from birdslam.sources.opening import open_recording\n"
@@ -105,7 +105,7 @@ def test_it_is_read_without_the_renderer() -> None:
     subprocess.run([sys.executable, "-c", code], check=True, timeout=600)
 
 
-def test_it_is_a_source_like_others() -> None:
+def test_drive_opens_like_other_sources() -> None:
     source = open_source(load(None, {"source.uri": "demo"}))
     assert not source.live
     assert source.name == "demo"

@@ -1,4 +1,4 @@
-"""The report of a run over the shipped drive: the truth has no error, and a known error is reported with its size."""
+"""The report on the shipped drive: the truth has no error, and known errors are reported with their size."""
 
 from __future__ import annotations
 
@@ -79,9 +79,7 @@ def test_the_truth_has_no_errors(demo: DemoRecording, truthful: list[Estimate]) 
     assert found.found == 1.0
 
 
-def test_a_scale_that_is_off_is_found_and_is_no_error_from_the_ego(
-    demo: DemoRecording, truthful: list[Estimate]
-) -> None:
+def test_scale_error_is_found_and_not_counted_relative_to_ego(demo: DemoRecording, truthful: list[Estimate]) -> None:
     found = grade(demo, [stretched(estimate, 1.05) for estimate in truthful])
     assert found.ego_scale_error == pytest.approx(0.05, abs=0.005)
     assert found.ego_ate_m > 0.02 * found.path_m
@@ -90,7 +88,7 @@ def test_a_scale_that_is_off_is_found_and_is_no_error_from_the_ego(
     assert found.vehicle_centre_m == pytest.approx(0.0, abs=1e-9)
 
 
-def test_a_new_epoch_goes_on_where_the_last_one_ended(demo: DemoRecording, truthful: list[Estimate]) -> None:
+def test_new_epoch_continues_at_last_pose(demo: DemoRecording, truthful: list[Estimate]) -> None:
     half = len(truthful) // 2
     whole, cut = grade(demo, truthful), [*truthful[:half]]
     origin = truthful[half].T_world_ego.inverse()
@@ -115,9 +113,7 @@ def test_a_vehicle_out_of_range_or_hidden_matches_no_track(demo: DemoRecording, 
     assert match(estimate, [body], [msgspec.structs.replace(vehicle, T_world_vehicle=away)]) == []
 
 
-def test_a_vehicle_predicted_between_two_detections_counts_as_reported_not_as_found(
-    demo: DemoRecording, truthful: list[Estimate]
-) -> None:
+def test_predicted_vehicle_counts_as_reported_not_detected(demo: DemoRecording, truthful: list[Estimate]) -> None:
     def aged(age_ns: int) -> DemoGrade:
         vehicles = tuple(msgspec.structs.replace(v, age_ns=age_ns) for v in truthful[0].vehicles)
         return grade(demo, [msgspec.structs.replace(truthful[0], vehicles=vehicles)])
@@ -127,7 +123,7 @@ def test_a_vehicle_predicted_between_two_detections_counts_as_reported_not_as_fo
     assert (aged(IN_SIGHT_NS + 1).found, aged(IN_SIGHT_NS + 1).reported) == (0.0, 0.0)
 
 
-def test_nothing_is_known_of_the_vehicles_of_a_drive_without_any(demo: DemoRecording, truthful: list[Estimate]) -> None:
+def test_drive_without_vehicles_has_no_vehicle_results(demo: DemoRecording, truthful: list[Estimate]) -> None:
     found = grade(demo, [msgspec.structs.replace(estimate, vehicles=()) for estimate in truthful])
     assert (found.vehicles, found.vehicle_ate_m, found.vehicle_centre_m, found.found) == (0, None, None, 0.0)
     text = dict(rows({"truth": msgspec.to_builtins(found)}))
@@ -135,14 +131,14 @@ def test_nothing_is_known_of_the_vehicles_of_a_drive_without_any(demo: DemoRecor
     assert "can't write" in dict(final_rows({"video": None}))["video"]
 
 
-def test_true_egos_begin_at_the_origin_and_go_forward(demo: DemoRecording) -> None:
+def test_true_ego_starts_at_origin_and_moves_forward(demo: DemoRecording) -> None:
     egos = true_egos(demo)
     assert len(egos) == len(demo)
     np.testing.assert_allclose([egos[0].x_m, egos[0].y_m, egos[0].yaw_rad], 0.0, atol=1e-9)
     assert egos[30].x_m > 8.0
 
 
-def test_a_run_leaves_a_video_and_its_figures(demo: DemoRecording, truthful: list[Estimate], tmp_path: Path) -> None:
+def test_run_writes_video_and_results(demo: DemoRecording, truthful: list[Estimate], tmp_path: Path) -> None:
     configuration = load(None, {"source.uri": "demo", "output": str(tmp_path)})
     report = DemoReport.of(configuration)
     assert report is not None
@@ -177,7 +173,7 @@ def test_a_run_without_truth_or_without_end_has_no_report(settings: dict[str, ob
     assert rows({}) == []
 
 
-def test_movers_are_judged_against_the_truth_at_whatever_range_they_stand(demo: DemoRecording) -> None:
+def test_movers_are_evaluated_at_any_range(demo: DemoRecording) -> None:
     """What moves is reported to drive, what stands is not; then all of it, at a third too far."""
 
     def told(everything: bool, factor: float) -> DemoGrade:

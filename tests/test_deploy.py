@@ -1,4 +1,4 @@
-"""The files of deploy/: the units, the scripts, and the service under a real systemd in namespaces of its own."""
+"""The files of deploy/: units, scripts, and the service under a real systemd in its own namespaces."""
 
 from __future__ import annotations
 
@@ -209,7 +209,7 @@ def test_the_sandbox_from_inside(machine: Machine) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_install_start_break_and_remove(machine: Machine) -> None:
+def test_install_start_fail_and_remove(machine: Machine) -> None:
     """One long story, since each step needs the one before it."""
     # Installed: a user, a virtual environment, a configuration; a second run changes nothing.
     install(machine)

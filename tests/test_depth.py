@@ -57,7 +57,7 @@ def test_metric_depth_in_its_unit_and_bounds(tmp_path: Path, shape: tuple[int, .
     assert depth.depth_m[0, :3].tolist() == [1.0, 50.0, 20.0]
 
 
-def test_canonical_depth_is_the_cameras_own(tmp_path: Path) -> None:
+def test_canonical_depth_is_converted_to_the_camera(tmp_path: Path) -> None:
     """A focal length twice the canonical one makes everything look twice as near as it is."""
     depth = run(tmp_path, METRIC + "canonical_focal_rel = 0.3125\n", np.full((1, 1, 8, 16), 10.0, np.float32))
     own = depth.in_metres(CAMERA)  # fx / width = 0.625
@@ -65,7 +65,7 @@ def test_canonical_depth_is_the_cameras_own(tmp_path: Path) -> None:
     assert own.in_metres(CAMERA) is own
 
 
-def test_the_padding_is_cut_away(tmp_path: Path) -> None:
+def test_padding_is_removed(tmp_path: Path) -> None:
     text = METRIC.replace('{ mode = "stretch" }', '{ mode = "fit_pad", align = "centre" }')
     values = np.full((1, 1, 16, 32), 99.0, np.float32)
     values[..., 4:12, :] = 7.0  # where a 4:1 image lies in the 2:1 input
@@ -93,7 +93,7 @@ def test_a_bad_manifest_is_refused_by_name(tmp_path: Path, text: str, named: str
         run(tmp_path, text, np.ones((1, 1, 8, 16), np.float32))
 
 
-def test_a_network_that_gives_no_map_is_refused(tmp_path: Path) -> None:
+def test_network_without_map_output_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match=r"depth\.output.*\(1, 2, 8, 16\)"):
         run(tmp_path, METRIC, np.ones((1, 2, 8, 16), np.float32))
 

@@ -1,4 +1,4 @@
-"""The pages are what the code says: those that commands write, and what those by hand name."""
+"""The pages match the code: generated pages, and names in written pages."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_every_name_of_the_page_is_in_the_code(page: str, names: int) -> None:
         assert named(name) is not None, name
 
 
-def test_each_equation_stands_where_the_page_says() -> None:
+def test_each_equation_is_where_the_page_says() -> None:
     told = {row["equation"]: in_the_code(row) for row in rows(DOCS / "method.md") if "equation" in row}
     assert list(told) == [f"Eq. {number}" for number in range(1, 9)]
     for equation, names in told.items():
@@ -105,27 +105,27 @@ def test_the_readme_is_one_page() -> None:
     assert max(len(line) for line in lines if not line.startswith("|")) <= 120
 
 
-def test_every_link_leads_somewhere() -> None:
+def test_every_link_has_a_target() -> None:
     for page in PAGES:
         for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", page.read_text()):
             assert target.startswith("https://") or (page.parent / target).exists(), f"{page.name}: {target}"
 
 
-def test_every_path_in_the_pages_is_there() -> None:
+def test_every_path_in_the_pages_exists() -> None:
     for page in PAGES:
         for path in re.findall(r"`([\w./-]+/[\w./-]*)`", page.read_text()):
             if path.split("/")[0] in FOLDERS and ".." not in path:
                 assert (ROOT / path).exists(), f"{page.name}: {path}"
 
 
-def test_every_module_that_a_page_names_by_its_file_is_there() -> None:
+def test_every_module_file_in_the_pages_exists() -> None:
     files = {path.name for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")} | {"setup.py"}
     for page in PAGES:
         for name in re.findall(r"`(\w+\.py)`", page.read_text()):
             assert name in files, f"{page}: {name}"
 
 
-def test_every_key_that_a_page_names_is_one() -> None:
+def test_every_key_in_the_pages_exists() -> None:
     keys = {field.key for field in fields(Configuration)} | set(KEYS)
     tables = {".".join(words[:end]) for key in keys for words in [key.split(".")] for end in range(1, len(words))}
     tops = {name.partition(".")[0] for name in tables}
@@ -169,7 +169,7 @@ def help_of(*words: str) -> str:
     return out.getvalue()
 
 
-def test_every_command_that_a_page_shows_is_one() -> None:
+def test_every_command_in_the_pages_exists() -> None:
     """`birdslam WORD`, `python -m perf WORD` and `make WORD`, in the words of the programs."""
     commands = {words: set(re.findall(r"^    ([a-z][a-z-]+)", help_of(*words), re.MULTILINE)) for words in WORDS}
     benchmarks = benchmark_modules()
@@ -186,7 +186,7 @@ def test_every_command_that_a_page_shows_is_one() -> None:
             assert word in targets, f"{page}: make {word}"
 
 
-def test_every_option_that_a_page_shows_is_one() -> None:
+def test_every_option_in_the_pages_exists() -> None:
     for page in PAGES:
         text = page.read_text().replace("\\\n", " ")
         shown = re.findall(r"^    (?:\.venv/bin/)?birdslam ([^#\n]+)", text, re.MULTILINE)
@@ -210,7 +210,7 @@ def test_the_page_of_sources_is_up_to_date(capsys: pytest.CaptureFixture[str]) -
     assert (DOCS / "sources.md").read_text().endswith(f"\n{reference}"), "its end is the output of `birdslam sources`"
 
 
-def test_every_setting_that_a_page_shows_is_a_users_key() -> None:
+def test_every_setting_in_the_pages_is_a_configuration_key() -> None:
     known = {field.key for field in fields(Configuration)}
     for page in PAGES:
         text = page.read_text()

@@ -1,4 +1,4 @@
-"""A place on Earth: fixes read, a drive tied to them, and files that other programs open."""
+"""Georeferencing: reading fixes, aligning a drive with them, and files for other programs."""
 
 import io
 import json
@@ -55,7 +55,7 @@ def worst_m(earth: Earth, poses: list[SE2], enu: np.ndarray) -> float:
     return float(np.hypot(east - enu[:, 0], north - enu[:, 1]).max())
 
 
-def test_a_drive_comes_to_its_align_with_fixes() -> None:
+def test_drive_is_aligned_with_its_fixes() -> None:
     t_ns, poses, enu = a_drive()
     earth = align_with_fixes(t_ns, poses, fixes_of(t_ns, enu, 1.0))
     assert worst_m(earth, poses, enu) < 1.5
@@ -63,7 +63,7 @@ def test_a_drive_comes_to_its_align_with_fixes() -> None:
     assert earth.calibration_hint(CAMERA) == ""
 
 
-def test_fixes_fifteen_metres_off_for_ten_seconds_do_not_bend_it() -> None:
+def test_fixes_with_15_m_error_for_10_s_do_not_bend_the_drive() -> None:
     t_ns, poses, enu = a_drive()
     wrong = enu.copy()
     wrong[120:220] += (12.0, -9.0)
@@ -72,7 +72,7 @@ def test_fixes_fifteen_metres_off_for_ten_seconds_do_not_bend_it() -> None:
     assert worst_m(earth, poses, enu) < 2.0
 
 
-def test_a_wrong_camera_height_is_told() -> None:
+def test_wrong_camera_height_is_reported() -> None:
     t_ns, poses, enu = a_drive(scale=0.94)
     earth = align_with_fixes(t_ns, poses, fixes_of(t_ns, enu, 1.0))
     assert earth.scale == pytest.approx(0.94, abs=0.01)
@@ -80,7 +80,7 @@ def test_a_wrong_camera_height_is_told() -> None:
     assert "a field of view of 85 degrees instead of 82" in earth.calibration_hint(CAMERA)
 
 
-def test_speeds_of_fixes_show_the_scale_where_their_places_hardly_do() -> None:
+def test_speeds_of_fixes_determine_the_scale_where_positions_do_not() -> None:
     t_ns, poses, enu = a_drive(scale=0.94)
     fixes = [msgspec.structs.replace(fix, sigma_m=30.0) for fix in fixes_of(t_ns, enu, 20.0)]
     by_places = align_with_fixes(t_ns, poses, fixes)
@@ -90,7 +90,7 @@ def test_speeds_of_fixes_show_the_scale_where_their_places_hardly_do() -> None:
     assert by_speeds.cov[3, 3] < 0.1 * by_places.cov[3, 3]
 
 
-def test_late_fixes_are_found_out_by_the_turn() -> None:
+def test_delay_of_fixes_is_estimated_in_a_turn() -> None:
     t_ns, poses, enu = a_drive()
     late = [
         GnssFix(**{**{n: getattr(fix, n) for n in fix.__struct_fields__}, "t_source_ns": fix.t_source_ns + 600_000_000})
@@ -103,7 +103,7 @@ def test_late_fixes_are_found_out_by_the_turn() -> None:
 @pytest.mark.parametrize(
     ("take", "why"), [(slice(0, 0), "no fixes"), (slice(0, 2), "fewer than 3"), (slice(0, 3), "are needed")]
 )
-def test_too_little_is_an_error(take: slice, why: str) -> None:
+def test_too_few_fixes_are_an_error(take: slice, why: str) -> None:
     t_ns, poses, enu = a_drive()
     with pytest.raises(EarthError, match=why):
         align_with_fixes(t_ns[:], [SE2()] * 400 if why == "are needed" else poses, fixes_of(t_ns, enu, 1.0)[take])
@@ -154,7 +154,7 @@ def test_csv_nmea_and_gpx_are_read() -> None:
         (b'<!DOCTYPE a [<!ENTITY b "c">]><gpx/>', "DOCTYPE"),
     ],
 )
-def test_what_holds_no_fixes_is_refused(data: bytes, why: str) -> None:
+def test_file_without_fixes_is_refused(data: bytes, why: str) -> None:
     with pytest.raises(GnssError, match=why):
         read_fixes(data, "a", 0)
 
@@ -168,7 +168,7 @@ def test_mutated_files_give_fixes_or_the_error(good: bytes, place: int, noise: b
     assert all(abs(fix.latitude_deg) <= 90.0 and math.isfinite(fix.sigma_m) for fix in fixes)
 
 
-def test_a_track_of_another_clock_is_laid_where_it_has_the_drives_shape() -> None:
+def test_track_of_another_clock_is_aligned_by_shape() -> None:
     """The fixes begin ten minutes before the drive and end two minutes after it."""
     t_ns, poses, enu = a_drive()
     before = enu[0] + np.outer(np.arange(600, 0, -1), (-7.0, 3.0)) + 40.0 * np.sin(np.arange(600))[:, None]
@@ -208,7 +208,7 @@ def test_nmea_is_recognized_behind_what_dashcams_write_before_it(before: bytes) 
     assert fix.latitude_deg == pytest.approx(48.0 + 7.038 / 60.0)
 
 
-def test_fixes_without_a_date_go_on_over_midnight() -> None:
+def test_fixes_without_date_continue_over_midnight() -> None:
     lines = b"".join(sentence(GGA.format(time)) for time in ("235958.00", "235959.50", "000001.00"))
     fixes = read_fixes(lines, "a.nmea", 5)
     assert [fix.t_source_ns - 5 for fix in fixes] == [0, 1_500_000_000, 3_000_000_000]
@@ -218,7 +218,7 @@ def test_fixes_without_a_date_go_on_over_midnight() -> None:
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
-def test_a_table_is_read_by_what_its_columns_mean(encoding: str) -> None:
+def test_table_columns_are_identified_by_meaning(encoding: str) -> None:
     text = "Time,Lat,Lon,Speed_kmh\n1700000000.5,51.0,7.0,36\n1700000001.5,51.1,7.0,\n"
     track = read_track(text.encode(encoding), "a.csv", 3)
     assert [fix.t_source_ns for fix in track.fixes] == [3, 1_000_000_003]  # Unix time, and the film begins at 0
@@ -245,7 +245,7 @@ def test_the_files_are_valid_and_contain_the_line(tmp_path: Path) -> None:
         write_geo_lines(tmp_path / "way.shp", [way])
 
 
-def test_the_dashcams_own_fixes_are_read(data_dir: Path) -> None:
+def test_fixes_inside_a_dashcam_film_are_read(data_dir: Path) -> None:
     path = data_dir / "dashcam" / "town_gps.csv"
     if not path.exists():
         pytest.skip(f"{path}: is not there")
@@ -258,7 +258,7 @@ def test_the_dashcams_own_fixes_are_read(data_dir: Path) -> None:
     st.dictionaries(st.integers(0, 39), st.tuples(st.floats(-1e5, 1e5), st.floats(-1e5, 1e5)), max_size=4),
     st.integers(0, 5),
 )
-def test_a_few_fixes_anywhere_do_not_move_the_drive(wrong: dict[int, tuple[float, float]], seed: int) -> None:
+def test_few_outlier_fixes_do_not_move_the_drive(wrong: dict[int, tuple[float, float]], seed: int) -> None:
     """Of 40 fixes up to four are off by up to 100 km, the first ones too."""
     t_ns, poses, enu = a_drive()
     moved = enu.copy()
@@ -269,7 +269,7 @@ def test_a_few_fixes_anywhere_do_not_move_the_drive(wrong: dict[int, tuple[float
     assert earth.outliers <= len(wrong) + 1
 
 
-def test_a_fix_at_zero_zero_is_no_fix() -> None:
+def test_fix_at_zero_zero_is_ignored() -> None:
     rows = "time_s,latitude_deg,longitude_deg\n" + "\n".join(f"{k},{51.0 + 1e-5 * k},7.0" for k in range(5))
     found = read_fixes(f"{rows}\n5,0.0,0.0\n6,51.0,7.0\n".encode(), "fixes.csv", 0)
     assert len(found) == 6

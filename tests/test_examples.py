@@ -1,4 +1,4 @@
-"""The examples of other people's detectors, run: the program on a film and a file of boxes, the notebook by cells."""
+"""The examples with external detectors: the program on a film and a file of boxes, the notebook cell by cell."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ FRAMES = 12
 
 
 @pytest.mark.parametrize(("name", "most"), [("speeds.py", 25), ("stop_for_people.py", 20)])
-def test_an_example_is_as_short_as_it_says(name: str, most: int) -> None:
+def test_example_has_the_stated_length(name: str, most: int) -> None:
     assert sum(bool(line.strip()) for line in (EXAMPLES / name).read_text().splitlines()) <= most
 
 

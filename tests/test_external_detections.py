@@ -1,4 +1,4 @@
-"""Another detector's boxes: in a program, from a file, by other libraries' objects, with another tracker's ids."""
+"""Boxes of an external detector: from a program, a file, or objects of other libraries, with external track ids."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def seen() -> Seen:
     raise AssertionError("the shipped drive is longer")
 
 
-def test_each_box_is_answered_in_its_place(seen: Seen) -> None:
+def test_each_box_has_a_result_at_its_index(seen: Seen) -> None:
     for found, placed, estimate in zip(seen.found, seen.placed, seen.estimates, strict=True):
         assert len(placed) == len(found)
         reported = {vehicle.vehicle: vehicle for vehicle in estimate.vehicles}
@@ -87,7 +87,7 @@ def test_each_box_is_answered_in_its_place(seen: Seen) -> None:
     assert all(place.distance_sigma_m > 0.0 and place.speed_sigma_mps is not None for place in last)
 
 
-def test_the_order_of_the_boxes_is_the_callers(seen: Seen) -> None:
+def test_order_of_boxes_is_kept(seen: Seen) -> None:
     slam = BirdSLAM.with_shipped_networks(seen.recording.camera, seen.recording.rate_hz)
     for frame, found, placed in zip(seen.frames, seen.found, seen.placed, strict=True):
         back = slice(None, None, -1)
@@ -113,7 +113,7 @@ def test_a_file_of_the_same_boxes_gives_the_same_estimates(seen: Seen, tmp_path:
     assert any(expected)
 
 
-def test_boxes_of_another_tracker_keep_its_ids() -> None:
+def test_ids_of_external_tracker_are_kept() -> None:
     camera, ground = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65), GroundPlane(1.65)
     tracker = Tracker(camera, TrackingConfig(), LocalisationConfig(), GroundSizeFilter(camera, GroundSizeConfig()))
     rows = camera.cy_px + camera.fy_px * ground.height_m / np.array([12.0, 12.0, 20.0])
@@ -149,15 +149,13 @@ def test_only_filters_ids_along_with_boxes() -> None:
         ([[0, 0, 9, 9]], ["car"], None, [0.5], "integers"),
     ],
 )
-def test_boxes_that_are_none_are_refused(boxes: Any, labels: Any, scores: Any, ids: Any, says: str) -> None:
+def test_invalid_boxes_are_refused(boxes: Any, labels: Any, scores: Any, ids: Any, says: str) -> None:
     with pytest.raises(ValueError, match=says):
         external_detections(boxes, labels, scores, ids)
 
 
 @given(st.floats(100, 900), st.floats(100, 500), st.floats(20, 250), st.floats(20, 150))
-def test_a_box_of_a_distorted_image_is_undistorted_as_the_image_is(
-    x: float, y: float, width: float, height: float
-) -> None:
+def test_box_of_distorted_image_is_undistorted(x: float, y: float, width: float, height: float) -> None:
     box = np.array([[x, y, x + width, y + height]])
     straight = undistort_boxes(LENS, box)[0]
     x1, y1, x2, y2 = straight
@@ -174,7 +172,7 @@ def undistort_points_back(px: np.ndarray) -> np.ndarray:
     return cv2.undistortPoints(px.reshape(-1, 1, 2), K, np.array(LENS.distortion), P=K).reshape(-1, 2)
 
 
-def test_how_sure_edges_are_goes_by_the_detectors_family(tmp_path: Path) -> None:
+def test_edge_sigma_follows_the_detector_family(tmp_path: Path) -> None:
     boxes, labels = [[10.0, 20.0, 40.0, 60.0]], ["car"]
     assert external_detections(boxes, labels).edge_sigma == UNKNOWN
     assert external_detections(boxes, labels, detector="configured").edge_sigma is None
@@ -275,7 +273,7 @@ def test_boxes_inside_lie_in_the_image(corners: list[tuple[float, float, float, 
         ('[{"image_id": 0, "category_id": 3, "bbox": [1, 2, 3], "score": 1}]', "entry 0 is not a box"),
     ],
 )
-def test_a_file_that_is_none_names_its_first_wrong_line(tmp_path: Path, text: str, says: str) -> None:
+def test_invalid_file_names_its_first_wrong_line(tmp_path: Path, text: str, says: str) -> None:
     path = tmp_path / "boxes"
     path.write_text(text)
     with pytest.raises(DatasetError, match=says):
@@ -301,7 +299,7 @@ def test_a_file_of_another_drive_is_refused(tmp_path: Path, seen: Seen) -> None:
     assert Configuration().source.detections == ""
 
 
-def test_supervisions_boxes_come_back_with_metres_in_columns(seen: Seen) -> None:
+def test_supervision_boxes_get_metres_in_columns(seen: Seen) -> None:
     supervision = pytest.importorskip("supervision")
     slam = BirdSLAM.with_shipped_networks(seen.recording.camera, seen.recording.rate_hz)
     for frame, found, placed in zip(seen.frames, seen.found, seen.placed, strict=True):
@@ -340,7 +338,7 @@ class Tracked:
     label: str = field(default="car")
 
 
-def test_norfairs_objects_keep_their_ids_and_get_their_places(seen: Seen) -> None:
+def test_norfair_objects_keep_ids_and_get_positions(seen: Seen) -> None:
     slam = BirdSLAM.with_shipped_networks(seen.recording.camera, seen.recording.rate_hz)
     for frame, found in zip(seen.frames, seen.found, strict=True):
         x = np.argsort(found.boxes_px[:, 0])[:3]  # three whose order across the image lasts

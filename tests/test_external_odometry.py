@@ -1,4 +1,4 @@
-"""Somebody else's odometry: its motions as they are told, no pose where it tells none, and files that can't be it."""
+"""External odometry: its motions are used as given, without a pose there is no motion, unusable files are refused."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def motions(odometry: ExternalOdometry, times_ns: list[int]) -> list[Motion | No
 
 @pytest.mark.parametrize("ego", [False, True], ids=["camera", "ego"])
 @pytest.mark.parametrize("times", [False, True], ids=["rows", "times"])
-def test_the_motions_are_the_files(ego: bool, times: bool) -> None:
+def test_motions_are_those_of_the_file(ego: bool, times: bool) -> None:
     told = trajectory(6, ego=ego, times=times)
     found = motions(ExternalOdometry(CAMERA, told, ExternalConfig(ego=ego)), [k * NS_PER_S // 10 for k in range(6)])
     assert found[0] is None
@@ -72,7 +72,7 @@ def test_the_motions_are_the_files(ego: bool, times: bool) -> None:
 
 
 @given(st.lists(st.floats(0.0, 0.9), min_size=2, max_size=8, unique=True))
-def test_between_two_poses_it_is_interpolated(times_s: list[float]) -> None:
+def test_poses_are_interpolated(times_s: list[float]) -> None:
     """At any times the motions add up to the way that the file has between them."""
     times_ns = sorted(round(t * NS_PER_S) for t in times_s)
     if len(set(times_ns)) < len(times_ns):
@@ -90,7 +90,7 @@ def test_between_two_poses_it_is_interpolated(times_s: list[float]) -> None:
     assert np.hypot(way.x_m, way.y_m) == pytest.approx(float(np.linalg.norm(last.p - first.p)), abs=1e-6)
 
 
-def test_no_pose_is_made_up_where_the_file_has_none() -> None:
+def test_missing_poses_are_not_invented() -> None:
     """A hole is coasted through with a covariance that grows, and the next pose is one from the last that was told."""
     told = trajectory(40)
     assert told.t_ns is not None
@@ -131,7 +131,7 @@ def test_a_drive_follows_the_file_and_is_invalid_where_it_ended() -> None:
     assert all(Status.NOT_INITIALISED in e.status for e in found[52:])
 
 
-def test_times_of_another_clock_give_a_status_and_no_pose() -> None:
+def test_times_of_another_clock_give_a_status() -> None:
     late = [k * NS_PER_S // 10 + 1000 * NS_PER_S for k in range(5)]
     found = driven(ExternalOdometry(CAMERA, trajectory(30), ExternalConfig()), late)
     assert all(not e.valid and Status.NOT_INITIALISED in e.status for e in found)
@@ -204,7 +204,7 @@ def test_a_file_of_another_drive_is_refused(tmp_path: Path) -> None:
         check_odometry(demo, tum(tmp_path / "early", TimedPoses(early.poses, early.t_ns - 10**12)))
 
 
-def test_the_configuration_says_which_odometry_it_is(tmp_path: Path) -> None:
+def test_configuration_selects_the_odometry(tmp_path: Path) -> None:
     path = kitti(tmp_path / "short", trajectory(12).poses)
     configuration = Configuration(source=SourceConfig(uri="demo", odometry=str(path)))
     assert isinstance(external_odometry(configuration, CAMERA), ExternalOdometry)

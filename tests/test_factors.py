@@ -1,4 +1,4 @@
-"""Factors of one's own, registered from here: a place by GNSS, a line of the lane, a loop; held to algebra."""
+"""User-defined factors: a GNSS position, a lane line, a loop; checked against linear algebra."""
 
 from __future__ import annotations
 
@@ -161,7 +161,7 @@ def fix_at(estimate: Estimate, away_m: tuple[float, float], sigma_m: float) -> F
 
 
 @pytest.mark.parametrize("sigma_m", [1e-3, 0.05, 10.0])
-def test_a_fix_takes_the_ego_there_by_its_share_of_the_weights(sigma_m: float) -> None:
+def test_fix_moves_the_ego_by_its_share_of_information(sigma_m: float) -> None:
     before = run(graph_with(), {})[-1]
     away_m = (0.06, -0.03)
     graph = graph_with(Gnss())
@@ -175,7 +175,7 @@ def test_a_fix_takes_the_ego_there_by_its_share_of_the_weights(sigma_m: float) -
         assert after.T_world_ego.y_m - before.T_world_ego.y_m == pytest.approx(away_m[1], abs=1e-3)
 
 
-def test_what_is_in_sight_goes_with_the_ego() -> None:
+def test_visible_vehicles_move_with_the_ego() -> None:
     """A fix says nothing of where vehicles are from the ego, beyond what the landmarks' common past makes of it."""
     before = run(graph_with(), {})[-1]
     after = run(graph_with(Gnss()), {LOG[-1].frame_id: (fix_at(before, (0.2, 0.1), 0.05),)})[-1]
@@ -186,7 +186,7 @@ def test_what_is_in_sight_goes_with_the_ego() -> None:
         assert b.T_world_vehicle.between(a.T_world_vehicle).log()[0] != pytest.approx(0.0, abs=0.01)
 
 
-def test_a_wild_fix_is_an_outlier_and_the_others_of_its_frame_are_not() -> None:
+def test_only_the_wrong_fix_of_a_frame_is_an_outlier() -> None:
     before = run(graph_with(), {})[-1]
     good, wild = fix_at(before, (0.05, 0.0), 0.05), fix_at(before, (9.0, 9.0), 0.05)
     last = LOG[-1].frame_id
@@ -197,7 +197,7 @@ def test_a_wild_fix_is_an_outlier_and_the_others_of_its_frame_are_not() -> None:
     np.testing.assert_allclose(both.cov, alone.cov, rtol=1e-6, atol=1e-10)
 
 
-def test_a_fix_past_the_gate_weighs_less() -> None:
+def test_fix_beyond_the_gate_weighs_less() -> None:
     before = run(graph_with(), {})[-1]
     P = np.reshape(before.cov, (3, 3))[:2, :2]
     sigma_m = 0.05
@@ -209,7 +209,7 @@ def test_a_fix_past_the_gate_weighs_less() -> None:
 
 
 @pytest.mark.parametrize("cut", [1, 20, 41])
-def test_a_checkpoint_goes_on_with_the_factor(cut: int) -> None:
+def test_checkpoint_restores_the_factor(cut: int) -> None:
     """With what it keeps: of a fix in each frame few count, and the next one that does is the same."""
     factors = lambda: [*standard_factors(*SETTINGS), Gnss(every_ns=10**9)]  # noqa: E731
     truth = run(graph_with(), {})
@@ -227,7 +227,7 @@ def test_a_checkpoint_goes_on_with_the_factor(cut: int) -> None:
         PoseGraph.restore(data, *SETTINGS)
 
 
-def test_a_new_epoch_forgets_what_the_factor_kept() -> None:
+def test_new_epoch_clears_the_factor_state() -> None:
     log = [*LOG[:5], replace(LOG[5], cc=None, status=())]
     graph = graph_with(Gnss(every_ns=10**12))
     for m in log:
@@ -235,7 +235,7 @@ def test_a_new_epoch_forgets_what_the_factor_kept() -> None:
         assert ("GNSS" in graph.outliers) == (m.frame_id in (LOG[0].frame_id, LOG[5].frame_id))
 
 
-def test_an_edge_that_is_no_number_is_left_out() -> None:
+def test_non_finite_edge_is_left_out() -> None:
     nowhere = Fix(float("nan"), 0.0, 1.0), Line(float("inf"), 0.0, (1.0, 1.0))
     assert run(graph_with(Gnss(), LaneLine()), {m.frame_id: nowhere for m in LOG}) == run(graph_with(), {})
 
@@ -243,7 +243,7 @@ def test_an_edge_that_is_no_number_is_left_out() -> None:
 # --- a line of the lane: a Jacobian of its own ---
 
 
-def test_a_line_holds_the_ego_across_it_and_its_heading() -> None:
+def test_line_constrains_lateral_position_and_heading() -> None:
     before = run(graph_with(), {})[-1]
     T = before.T_world_ego
     assert abs(np.sin(T.yaw_rad)) > 0.05  # the line is not the ego's own x axis
@@ -290,7 +290,7 @@ class TyingGap(Gap):
     ties_vehicles = True
 
 
-def test_vehicles_that_an_edge_ties_are_held_together() -> None:
+def test_vehicles_connected_by_an_edge_share_a_covariance() -> None:
     """Else each vehicle has its own block of P, and one that ties them is refused rather than taken by half."""
     apart, tied = graph_with(), graph_with(TyingGap())
     run(apart, {})
@@ -305,7 +305,7 @@ def test_vehicles_that_an_edge_ties_are_held_together() -> None:
         run(graph_with(Gap()), {})
 
 
-def test_a_line_of_a_vehicle_is_the_same_edge_together_and_apart() -> None:
+def test_line_of_a_vehicle_is_the_same_edge_jointly_and_separately() -> None:
     """Edges by each vehicle's own numbers, with Jacobians that are none of unit vectors."""
 
     class Aside(Factor):
@@ -335,7 +335,7 @@ def test_a_line_of_a_vehicle_is_the_same_edge_together_and_apart() -> None:
 # --- a loop between two poses of the window ---
 
 
-def test_a_loop_puts_the_ego_where_the_earlier_pose_sees_it() -> None:
+def test_loop_edge_corrects_the_ego() -> None:
     back, sigma = LOG[-4].frame_id, 1e-3
     plain, looped = graph_with(), graph_with(LoopClosure())
     run(plain, {})

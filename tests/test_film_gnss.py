@@ -137,7 +137,7 @@ def test_a_track_inside_a_film_is_read(container: Callable[[bytes, list[FilmFix]
 
 
 @exiftool
-def test_the_null_point_is_no_fix(tmp_path: Path) -> None:
+def test_fix_at_zero_zero_is_ignored(tmp_path: Path) -> None:
     path = tmp_path / "film.mp4"
     lost = [FilmFix(0.0, 0.0, BEGIN), *FIXES[1:]]
     path.write_bytes(novatek(film(path), lost))
@@ -145,7 +145,7 @@ def test_the_null_point_is_no_fix(tmp_path: Path) -> None:
 
 
 @exiftool
-def test_films_of_a_drive_give_one_track(tmp_path: Path) -> None:
+def test_films_of_a_drive_share_one_track(tmp_path: Path) -> None:
     for name, fixes in (("2.mp4", FIXES[:2]), ("1.mp4", FIXES[2:])):
         (tmp_path / name).write_bytes(novatek(film(tmp_path / name), fixes))
     track = tmp_path / "out" / "film.gpx"
@@ -184,7 +184,7 @@ def test_fixes_without_a_date_have_the_times_of_their_film(tmp_path: Path) -> No
 
 
 @exiftool
-def test_a_single_fix_is_no_track(tmp_path: Path) -> None:
+def test_single_fix_is_not_a_track(tmp_path: Path) -> None:
     path = tmp_path / "film.mp4"
     path.write_bytes(novatek(film(path), FIXES[:1]))
     assert track_of_films([path], tmp_path / "film.gpx") == 0
@@ -192,7 +192,7 @@ def test_a_single_fix_is_no_track(tmp_path: Path) -> None:
 
 @exiftool
 @pytest.mark.parametrize("option", ["--gnss", "--speed"])
-def test_a_film_without_a_track_is_refused_where_it_is_asked_for_one(
+def test_film_without_requested_track_is_refused(
     option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     film(tmp_path / "film.mp4")
@@ -202,7 +202,7 @@ def test_a_film_without_a_track_is_refused_where_it_is_asked_for_one(
 
 
 @exiftool
-def test_a_file_that_is_no_film_has_no_track(tmp_path: Path) -> None:
+def test_non_film_file_has_no_track(tmp_path: Path) -> None:
     (tmp_path / "film.mp4").write_bytes(b"no film")
     assert read_film(tmp_path / "film.mp4") == read_film(tmp_path / "missing.mp4") == []
 
@@ -219,7 +219,7 @@ def test_without_exiftool_the_remedy_is_named(
     assert "no film" in capsys.readouterr().err
 
 
-def test_a_found_track_that_does_not_fit_costs_no_other_result(tmp_path: Path) -> None:
+def test_unusable_track_does_not_affect_other_results(tmp_path: Path) -> None:
     """A requested one is an error, since its results are missing."""
     track = tmp_path / "film.gpx"
     write_geo_lines(track, [GeoLine("film", np.array([[48.0, 11.0], [49.0, 11.0]]), [0, 1_000_000_000])])

@@ -1,4 +1,4 @@
-"""Films at other sizes, rates and compressions show the same places at the same times."""
+"""Films at other sizes, rates and compressions show the same points at the same times."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ def film(images: int = 6) -> list[Timed]:
 
 
 @given(st.floats(0.5, 3.0), st.floats(0.0, 639.0), st.floats(0.0, 359.0))
-def test_a_pixel_of_another_size_is_the_same_ray(size: float, u: float, v: float) -> None:
+def test_pixel_at_another_size_is_the_same_ray(size: float, u: float, v: float) -> None:
     camera = Variant("", size=size).camera(CAMERA)
     x, y = camera.width_px / CAMERA.width_px, camera.height_px / CAMERA.height_px
     there = (np.array([[u, v]]) + 0.5) * [x, y] - 0.5
     np.testing.assert_allclose(camera.to_xy(there), CAMERA.to_xy(np.array([[u, v]])), atol=1e-9)
 
 
-def test_widths_that_no_film_has_are_left_out() -> None:
+def test_unsupported_widths_are_left_out() -> None:
     sizes = {variant.size for variant in EVERY}
     assert min(sizes) == 0.5
     assert all(320 <= 640 * size <= 3840 for size in sizes)
@@ -40,7 +40,7 @@ def test_widths_that_no_film_has_are_left_out() -> None:
 
 
 @pytest.mark.parametrize("part", PARTS)
-def test_a_part_begins_with_the_unchanged_film_and_names_each_variant_once(part: str) -> None:
+def test_part_starts_with_unchanged_film_and_unique_names(part: str) -> None:
     names = [variant.name for variant in variants(CAMERA, part)]
     assert names[0] == "unchanged"
     assert len(set(names)) == len(names) > 1
@@ -82,7 +82,7 @@ def test_an_interlaced_image_is_of_two_times_half_its_period_apart(tmp_path: Pat
     assert np.array_equal(shown[1][1][1::2], raw[3][1][1::2])
 
 
-def test_what_is_in_the_way_is_seen(tmp_path: Path) -> None:
+def test_obstructions_are_visible(tmp_path: Path) -> None:
     noise = {variant.name for variant in variants(CAMERA, "noise")}
     for variant in EVERY:
         if variant.shown is not None and variant.name not in noise:
@@ -93,14 +93,14 @@ def test_what_is_in_the_way_is_seen(tmp_path: Path) -> None:
             assert max(changed) > 10.0, variant.name
 
 
-def test_noise_is_in_each_image_and_no_eye_sees_it(tmp_path: Path) -> None:
+def test_noise_is_in_each_image_and_invisible(tmp_path: Path) -> None:
     for variant in variants(CAMERA, "noise"):
         if variant.shown is not None:
             for (_, shown), (_, raw) in zip(variant.images(iter(film()), tmp_path), film(), strict=True):
                 assert 1.0 < np.std(np.asarray(shown, float) - raw) < 2.0
 
 
-def test_a_truth_whose_every_third_step_is_too_long_makes_no_rate_another_one() -> None:
+def test_uneven_true_steps_do_not_affect_the_ratio_at_any_rate() -> None:
     """As KITTI's: the ways of a second are compared, not its frames."""
     courses = []
     for every in (1, 2):
@@ -116,7 +116,7 @@ def test_a_truth_whose_every_third_step_is_too_long_makes_no_rate_another_one() 
     assert courses[0]["first_valid_s"] == pytest.approx(0.6)
 
 
-def test_a_run_is_read_from_what_it_left(tmp_path: Path) -> None:
+def test_run_is_read_from_its_folder(tmp_path: Path) -> None:
     def status(k: int) -> str:
         return "standstill view_obstructed" if k == 7 else ""
 

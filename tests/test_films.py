@@ -89,7 +89,7 @@ STEPS = st.lists(st.integers(10, 400), min_size=1, max_size=12)
 
 @settings(max_examples=12)
 @given(STEPS, st.sampled_from([("mp4", "libx264"), ("mkv", "libx264"), ("ts", "libx264"), ("mov", "libx264")]))
-def test_the_times_are_the_containers_however_uneven(steps_ms: list[int], kind: tuple[str, str]) -> None:
+def test_times_are_those_of_the_container(steps_ms: list[int], kind: tuple[str, str]) -> None:
     suffix, codec = kind
     stamps = [0, *np.cumsum(steps_ms).tolist()]
     with tempfile.TemporaryDirectory() as folder:
@@ -108,7 +108,7 @@ def test_other_codecs_are_read_too(name: str, codec: str, tmp_path: Path) -> Non
     assert seen[4].image[:20, :30].mean() > seen[4].image[40:].mean() + 80.0
 
 
-def test_an_interlaced_film_is_seen_or_refused(tmp_path: Path) -> None:
+def test_interlaced_film_is_deinterlaced_or_refused(tmp_path: Path) -> None:
     """Some OpenCV gives nothing of its pictures, without a word."""
     path = tmp_path / "i.mp4"
     wide = np.random.default_rng(1).integers(60, 200, (HEIGHT // 4, WIDTH // 2), np.uint8).repeat(4, 0).repeat(4, 1)
@@ -133,7 +133,7 @@ def test_an_interlaced_film_is_seen_or_refused(tmp_path: Path) -> None:
         assert np.corrcoef(frame.image[::2, :, 0].ravel(), true.ravel())[0, 1] > 0.9
 
 
-def test_sound_and_odd_sizes_do_no_harm(tmp_path: Path) -> None:
+def test_sound_and_odd_sizes_are_supported(tmp_path: Path) -> None:
     assert len(frames(film(tmp_path / "a.mp4", range(0, 400, 40), audio=True))) == 10
     odd = Camera(97, 65, 80.0, 80.0, 48.0, 32.0, 1.4)
     (first, *_) = frames(film(tmp_path / "b.mp4", range(0, 400, 40), size=(97, 65)), odd)
@@ -142,7 +142,7 @@ def test_sound_and_odd_sizes_do_no_harm(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("degrees", "bright"), [(90, (0, 1)), (180, (1, 1)), (270, (1, 0))])
-def test_a_phones_film_stands_upright(degrees: int, bright: tuple[int, int], tmp_path: Path) -> None:
+def test_rotated_phone_film_is_upright(degrees: int, bright: tuple[int, int], tmp_path: Path) -> None:
     path = turned(film(tmp_path / "phone.mp4", range(0, 200, 40)), degrees)
     camera = CAMERA if degrees == 180 else UPRIGHT
     assert VideoRecording.frame_size(path, BagTopics()) == (camera.width_px, camera.height_px)
@@ -175,7 +175,7 @@ def test_films_of_a_directory_are_one_drive_in_natural_order(counts: list[int], 
         assert times_ms(later) == times_ms(seen)[3:]
 
 
-def test_a_gap_between_films_is_a_frame_that_says_so(tmp_path: Path) -> None:
+def test_gap_between_films_is_reported(tmp_path: Path) -> None:
     film(tmp_path / "20240131_120000.mp4", range(0, 2000, 40))
     film(tmp_path / "20240131_120002.mp4", range(0, 2000, 40))  # begins where the first ends
     film(tmp_path / "20240131_120134.mp4", range(0, 400, 40))  # half a minute after the second has ended: 90 s
@@ -189,14 +189,14 @@ def test_a_gap_between_films_is_a_frame_that_says_so(tmp_path: Path) -> None:
     assert seen[at - 1].t_source_ns < gaps[0].t_source_ns < seen[at + 1].t_source_ns
 
 
-def test_a_gap_within_a_film_is_told_too(tmp_path: Path) -> None:
+def test_gap_within_a_film_is_reported(tmp_path: Path) -> None:
     seen = frames(film(tmp_path / "f.mkv", [0, 40, 80, 5080, 5120, 5160]))
     assert [frame.image is None for frame in seen] == [False, False, False, True, False, False, False]
     assert times_ms(seen)[4:] == pytest.approx([5080, 5120, 5160], abs=1)
 
 
 @pytest.mark.parametrize("prefix", [b"", b"\0\0\0\0"])  # cameras put a time before each packet
-def test_a_transport_stream_that_was_cut_off_says_so(prefix: bytes, tmp_path: Path) -> None:
+def test_truncated_transport_stream_is_reported(prefix: bytes, tmp_path: Path) -> None:
     whole = film(tmp_path / "whole.ts", range(0, 800, 40)).read_bytes()
     whole = b"".join(prefix + whole[at : at + 188] for at in range(0, len(whole), 188))
     for name, length in (("whole.ts", len(whole)), ("cut.ts", 2 * len(whole) // 3 // 188 * 188 + 50)):
@@ -210,7 +210,7 @@ def test_a_transport_stream_that_was_cut_off_says_so(prefix: bytes, tmp_path: Pa
     assert last.error.endswith(f"cut.ts: ends within a packet, after {len(seen)} frames: cut off")
 
 
-def test_what_is_no_film_is_one_clear_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_non_film_file_is_a_one_line_error(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     whole = film(tmp_path / "whole.mp4", range(0, 2000, 40)).read_bytes()
     (tmp_path / "empty.mp4").write_bytes(b"")
     (tmp_path / "cut.mp4").write_bytes(whole[: len(whole) // 2])
@@ -269,7 +269,7 @@ def test_a_phones_metadata_state_the_focal_length(suffix: str, tmp_path: Path) -
 
 @settings(max_examples=60)
 @given(st.data())
-def test_damaged_metadata_say_nothing_or_a_focal_length(data: st.DataObject) -> None:
+def test_damaged_metadata_do_no_harm(data: st.DataObject) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = film(Path(folder) / "f.mp4", [0, 40], metadata={FOCAL_KEY: "26"})
         whole = bytearray(path.read_bytes())
@@ -303,7 +303,7 @@ def test_films_of_several_cameras_are_refused_with_their_names(tmp_path: Path, n
         open_recording(f"video:{tmp_path}/*-top*", CAMERA)
 
 
-def test_other_letters_of_names_are_no_cameras(tmp_path: Path) -> None:
+def test_letters_in_file_names_do_not_split_cameras(tmp_path: Path) -> None:
     for name in ("GX010123", "GX020123", "clipA", "driver", "forward"):
         film(tmp_path / f"{name}.mp4", range(0, 120, 40))
     assert len(open_recording(f"video:{tmp_path}", CAMERA)) == 15
@@ -351,7 +351,7 @@ WIDE = Camera(320, 240, 300.0, 300.0, 160.0, 120.0, 1.4)
 
 
 @pytest.mark.parametrize("overlap", [0, 7, 30, 75])
-def test_films_that_overlap_are_one_drive_without_a_frame_twice(tmp_path: Path, overlap: int) -> None:
+def test_overlapping_films_have_no_duplicate_frames(tmp_path: Path, overlap: int) -> None:
     moving_film(tmp_path / "a_001.mp4", range(120))
     moving_film(tmp_path / "a_002.mp4", range(120 - overlap, 200), quality="30")
     seen = list(open_recording(f"video:{tmp_path}", WIDE).frames())
@@ -365,7 +365,7 @@ def test_films_that_overlap_are_one_drive_without_a_frame_twice(tmp_path: Path, 
     assert [(frame.index, frame.t_source_ns) for frame in later] == [(f.index, f.t_source_ns) for f in seen[150:]]
 
 
-def test_the_overlap_of_films_is_cut_whatever_the_stride(tmp_path: Path) -> None:
+def test_overlap_of_films_is_removed_at_any_stride(tmp_path: Path) -> None:
     moving_film(tmp_path / "a_001.mp4", range(120))
     moving_film(tmp_path / "a_002.mp4", range(90, 200), quality="30")
     recording = open_recording(f"video:{tmp_path}", WIDE, 3)

@@ -98,7 +98,7 @@ def test_a_recording_gives_the_trajectories_that_are_evaluated_bit_for_bit(tmp_p
         assert live.count(b"\n") >= 60
 
 
-def test_a_new_epoch_goes_on_in_the_same_file(tmp_path: Path) -> None:
+def test_new_epoch_continues_in_the_same_file(tmp_path: Path) -> None:
     frames = measured(60)
     (tmp_path / "t").mkdir()
     tape = Tape(tmp_path / "t")
@@ -118,7 +118,7 @@ def test_a_new_epoch_goes_on_in_the_same_file(tmp_path: Path) -> None:
     assert any("# epoch 1: a new world frame begins" in text for text in texts)
 
 
-def test_what_was_seen_for_the_last_time_is_let_go(tmp_path: Path) -> None:
+def test_memory_of_finished_tracks_is_released(tmp_path: Path) -> None:
     frames, graph = measured(60), PoseGraph(GraphConfig(), WeightsConfig())
     final = FinalTracks(tmp_path, last_seen(frames))
     for measurements in frames:
@@ -129,7 +129,7 @@ def test_what_was_seen_for_the_last_time_is_let_go(tmp_path: Path) -> None:
     assert final.vehicles == len(list(tmp_path.glob("*.final.tum.txt")))
 
 
-def test_a_recording_that_was_cut_off_gives_what_it_has(tmp_path: Path) -> None:
+def test_truncated_recording_gives_partial_results(tmp_path: Path) -> None:
     frames = measured(40)
     tape = taped(tmp_path / "t", frames)
     tape.path.write_bytes(tape.path.read_bytes()[: tape.path.stat().st_size // 2])
@@ -140,7 +140,7 @@ def test_a_recording_that_was_cut_off_gives_what_it_has(tmp_path: Path) -> None:
     assert tracks(tmp_path / "out" / "tracks") == smoothed(zip(frames, there, strict=False))
 
 
-def test_estimates_whose_measurements_were_not_recorded_are_passed_over(tmp_path: Path) -> None:
+def test_estimates_without_recorded_measurements_are_skipped(tmp_path: Path) -> None:
     frames = measured(30)
     (tmp_path / "t").mkdir()
     tape = Tape(tmp_path / "t")
@@ -185,7 +185,7 @@ def test_replay_writes_them_too(tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 @pytest.mark.slow
 @pytest.mark.processes
-def test_a_run_writes_what_is_evaluated_and_takes_its_temporary_recording_away(tmp_path: Path) -> None:
+def test_run_writes_evaluated_trajectories_and_removes_temporary_recording(tmp_path: Path) -> None:
     """The shipped drive through the three processes; --record only so that the test can evaluate the same records."""
     arguments = [
         *("run", "--source", "demo", "--rate", "max", "--set", "source.frames=24", "--smooth"),
@@ -286,7 +286,7 @@ def test_the_images_of_a_recording_are_drawn_by_their_numbers_in_the_run(tmp_pat
     assert len(pictures(video)) == 10  # every second frame of 33 Hz
 
 
-def test_a_video_that_cannot_be_is_named_before_anything_starts(
+def test_unwritable_video_is_named_before_start(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "is.mp4").mkdir()
@@ -309,7 +309,7 @@ def test_a_video_that_cannot_be_is_named_before_anything_starts(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "is.mp4"]
 
 
-def test_folders_on_the_way_to_a_video_are_made(tmp_path: Path) -> None:
+def test_folders_of_a_video_are_created(tmp_path: Path) -> None:
     check_video(tmp_path / "new" / "folder" / "v.mp4", CAMERA, 10.0)
     assert list((tmp_path / "new" / "folder").iterdir()) == []
 

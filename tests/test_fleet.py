@@ -54,7 +54,7 @@ needs_openssl = pytest.mark.skipif(shutil.which("openssl") is None, reason="open
 
 
 @given(st.text(_LETTERS, max_size=40), st.sampled_from(sorted({*TOPICS, *QUERIES})))
-def test_a_vehicles_name_reaches_no_key_but_its_own(name: str, topic: str) -> None:
+def test_vehicle_name_matches_only_its_own_keys(name: str, topic: str) -> None:
     """Whatever somebody calls a vehicle: it is refused, or the key is one plain key that names it alone."""
     try:
         key = key_of(name, topic)
@@ -83,7 +83,7 @@ def test_a_received_key_names_one_vehicle_or_none(key: str) -> None:
 
 
 @given(st.text(alphabet="abc*/$ .-_", min_size=1, max_size=12))
-def test_a_name_with_a_wildcard_is_no_name_in_any_table(name: str) -> None:
+def test_name_with_wildcard_is_refused_in_any_table(name: str) -> None:
     good = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,31}", name) is not None
     for table in (RouterConfig, FleetConfig):
         try:
@@ -95,7 +95,7 @@ def test_a_name_with_a_wildcard_is_no_name_in_any_table(name: str) -> None:
 
 
 @given(st.lists(st.from_regex(r"[ab0][ab_-]{0,3}", fullmatch=True), min_size=1, max_size=4, unique=True), st.data())
-def test_by_the_routers_rules_a_vehicle_writes_its_own_keys_alone(names: list[str], data: st.DataObject) -> None:
+def test_vehicle_may_write_only_its_own_keys(names: list[str], data: st.DataObject) -> None:
     access = access_control(tuple(names), ("operator",))
     rules = {rule["id"]: rule for rule in access["rules"]}
     subjects = {subject["id"]: subject["cert_common_names"] for subject in access["subjects"]}
@@ -293,7 +293,7 @@ def raw_config(tls: Path, port: int, name: str, authority: str = "ca.pem", limit
 
 @processes
 @needs_openssl
-def test_each_certificate_may_do_its_own_and_no_more(tls: Path, port: int) -> None:
+def test_each_certificate_has_only_its_permissions(tls: Path, port: int) -> None:
     """A vehicle, a listener and a stranger write under every key, say that somebody lives, and answer queries."""
     with ExitStack() as stack:
         stack.enter_context(zenoh.open(router_config(router_table(tls, port))))
@@ -345,7 +345,7 @@ def test_each_certificate_may_do_its_own_and_no_more(tls: Path, port: int) -> No
 
 @processes
 @needs_openssl
-def test_who_has_no_certificate_of_the_authority_gets_no_connection(tls: Path, port: int) -> None:
+def test_connection_needs_a_certificate_of_the_authority(tls: Path, port: int) -> None:
     with zenoh.open(router_config(router_table(tls, port))):
         for name, authority in (("", "ca.pem"), ("other/red.vehicle", "ca.pem")):
             with pytest.raises(zenoh.ZError):
@@ -357,7 +357,7 @@ def test_who_has_no_certificate_of_the_authority_gets_no_connection(tls: Path, p
 
 @processes
 @needs_openssl
-def test_a_flood_and_a_death_cost_the_others_nothing(
+def test_flood_and_crash_do_not_affect_other_vehicles(
     tmp_path_factory: pytest.TempPathFactory, tls: Path, port: int
 ) -> None:
     """Red sends as fast as it can, then dies: green and blue come without a gap, and each is told of as it is."""
@@ -400,7 +400,7 @@ def test_a_flood_and_a_death_cost_the_others_nothing(
 
 @processes
 @needs_openssl
-def test_a_router_that_comes_back_is_found(tmp_path_factory: pytest.TempPathFactory, tls: Path, port: int) -> None:
+def test_restarted_router_is_found(tmp_path_factory: pytest.TempPathFactory, tls: Path, port: int) -> None:
     """By a vehicle and by a listener; meanwhile the vehicle is told as not alive."""
     table = router_table(tls, port)
     router = zenoh.open(router_config(table))
@@ -420,7 +420,7 @@ def test_a_router_that_comes_back_is_found(tmp_path_factory: pytest.TempPathFact
 @pytest.mark.slow
 @processes
 @needs_openssl
-def test_the_commands_find_each_other_again(tmp_path_factory: pytest.TempPathFactory, tls: Path, port: int) -> None:
+def test_commands_reconnect(tmp_path_factory: pytest.TempPathFactory, tls: Path, port: int) -> None:
     """`birdslam uplink` before its router, a router that is killed and begun again, an uplink that is killed."""
     base = tmp_path_factory.mktemp("f")
     (base / "router.toml").write_text(
@@ -517,7 +517,7 @@ def test_an_uplink_keeps_its_configured_rate(tmp_path_factory: pytest.TempPathFa
 
 @processes
 @needs_openssl
-def test_a_closed_client_wakes_who_waits(tls: Path, port: int) -> None:
+def test_closing_a_client_wakes_its_waiters(tls: Path, port: int) -> None:
     with zenoh.open(router_config(router_table(tls, port))):
         fleet = Fleet(link(tls, port, "operator"))
         woken: list[type] = []
@@ -538,7 +538,7 @@ def test_a_closed_client_wakes_who_waits(tls: Path, port: int) -> None:
 
 @needs_openssl
 @processes
-def test_a_table_that_cannot_be_names_its_key(tls: Path) -> None:
+def test_invalid_table_names_its_key(tls: Path) -> None:
     for changes, key in (
         ({"listen": "tcp/127.0.0.1:1"}, "router.listen"),
         ({"ca": str(tls / "none.pem")}, "router.ca"),
@@ -552,5 +552,5 @@ def test_a_table_that_cannot_be_names_its_key(tls: Path) -> None:
             open_link(link(tls, 1, "operator", **changes), 0.1)
 
 
-def test_what_leaves_a_vehicle_is_estimates_and_healths_alone() -> None:
+def test_only_estimates_and_health_leave_a_vehicle() -> None:
     assert set(FORWARDED) == {"estimate", *(f"health/{node}" for node in PROCESSES)}

@@ -1,4 +1,4 @@
-"""docs/examples/foxglove-layout.json against what a recording holds."""
+"""docs/examples/foxglove-layout.json matches the contents of a recording."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def panels_of(part: Any) -> Iterator[str]:
 PATHS = sorted({path for panel in LAYOUT["configById"].values() for path in paths_of(panel)})
 
 
-def test_every_panel_has_its_place() -> None:
+def test_every_panel_has_a_position() -> None:
     placed = list(panels_of(LAYOUT["layout"]))
     assert sorted(placed) == sorted(LAYOUT["configById"])
     assert {name.partition("!")[0] for name in placed} == {"3D", "Image", "Plot", "StateTransitions"}
@@ -68,7 +68,7 @@ def test_every_panel_has_its_place() -> None:
 
 
 @pytest.mark.parametrize("path", PATHS)
-def test_every_name_is_one_of_a_recordings(path: str) -> None:
+def test_every_name_exists_in_a_recording(path: str) -> None:
     """By the schemas, which Foxglove reads: a field that they do not have is not drawn."""
     topic, keys = topic_and_keys(path)
     part = msgspec.json.decode(schema(JSON_CHANNELS[topic]))

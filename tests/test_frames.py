@@ -1,4 +1,4 @@
-"""The ring of frames: what is written is read back; what is torn, gone or foreign is never handed out as a frame."""
+"""The ring of frames: written frames are read back; torn, overwritten or foreign data is never returned as a frame."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def reader(tmp_path: Path) -> Iterator[FrameReader]:
         yield reader
 
 
-def test_every_frame_that_fits_comes_back(tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_every_frame_that_fits_is_read_back(tmp_path_factory: pytest.TempPathFactory) -> None:
     path = tmp_path_factory.mktemp("frames") / "ring"
     with FrameRing(path, HEIGHT_PX, WIDTH_PX, slots=2) as ring, FrameReader(path) as reader:
 
@@ -101,7 +101,7 @@ def test_a_frame_is_a_copy(ring: FrameRing, reader: FrameReader) -> None:
     np.testing.assert_array_equal(got, image)
 
 
-def test_a_changed_byte_is_no_frame(ring: FrameRing, reader: FrameReader) -> None:
+def test_changed_byte_is_detected(ring: FrameRing, reader: FrameReader) -> None:
     image = some_image(3)
     ref = ref_of(image, ring.write(image), ring.epoch)
     assert reader.read(ref) is not None
@@ -130,7 +130,7 @@ def test_a_changed_byte_is_no_frame(ring: FrameRing, reader: FrameReader) -> Non
         {"channels": 2},
     ],
 )
-def test_a_reference_that_is_wrong_gives_nothing(ring: FrameRing, reader: FrameReader, changes: dict[str, int]) -> None:
+def test_wrong_reference_gives_no_frame(ring: FrameRing, reader: FrameReader, changes: dict[str, int]) -> None:
     image = some_image(1)
     right = ref_of(image, ring.write(image), ring.epoch)
     assert reader.read(right) is not None
@@ -162,7 +162,7 @@ def test_a_foreign_file_is_named(tmp_path: Path, reader: FrameReader, content: b
         reader.read(ref_of(some_image(1), (0, 2), 1))
 
 
-def test_a_ring_cut_short_is_named(ring: FrameRing, reader: FrameReader) -> None:
+def test_truncated_ring_is_named(ring: FrameRing, reader: FrameReader) -> None:
     cut = ring.path.read_bytes()[:-64]
     ring.path.unlink()  # not truncated in place: the writer still has it mapped
     ring.path.write_bytes(cut)
@@ -170,7 +170,7 @@ def test_a_ring_cut_short_is_named(ring: FrameRing, reader: FrameReader) -> None
         reader.read(ref_of(some_image(1), (0, 2), ring.epoch))
 
 
-def test_refuses_what_is_no_frame(tmp_path: Path, ring: FrameRing) -> None:
+def test_invalid_frames_are_refused(tmp_path: Path, ring: FrameRing) -> None:
     for image in (
         some_image(1, height_px=HEIGHT_PX + 1),
         np.zeros((HEIGHT_PX, WIDTH_PX), np.float32),
@@ -187,7 +187,7 @@ def test_refuses_what_is_no_frame(tmp_path: Path, ring: FrameRing) -> None:
         FrameRing(tmp_path / "other", 5, 5, slots=1)
 
 
-def test_no_room_is_said_before_the_drive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_space_is_reported_before_the_drive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(_fd: int, _offset: int, _length: int) -> None:
         raise OSError(28, "No space left on device")
 
@@ -239,7 +239,7 @@ def numbered(n: int, epoch: int) -> FrameRef:
 
 
 @pytest.mark.processes
-def test_a_writer_killed_in_the_middle_of_a_frame_leaves_no_half_frame(tmp_path: Path, reader: FrameReader) -> None:
+def test_killed_writer_leaves_no_partial_frame(tmp_path: Path, reader: FrameReader) -> None:
     process, epoch, _ = start_writer(reader.path, die_at=5)
     with process:
         assert process.wait(timeout=120) == -signal.SIGKILL
@@ -254,7 +254,7 @@ def test_a_writer_killed_in_the_middle_of_a_frame_leaves_no_half_frame(tmp_path:
 
 
 @pytest.mark.processes
-def test_two_processes_under_stress_never_show_a_wrong_frame(reader: FrameReader) -> None:
+def test_two_processes_under_stress_never_read_a_wrong_frame(reader: FrameReader) -> None:
     whole = missed = 0
     buffer = np.empty((96, 128, 3), np.uint8)
     for turn in range(4):

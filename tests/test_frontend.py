@@ -1,4 +1,4 @@
-"""The front end: motions chained, edges that name their frames, and what it says when there is nothing to say."""
+"""The front end: chained motions, edges that name their frames, and statuses without measurements."""
 
 import dataclasses
 import math
@@ -88,7 +88,7 @@ def run(script: dict[int, Motion], views: list[Ready], images: dict[int, None] |
     return [front.measure(frame(k, (images or {}).get(k, IMAGE)), view) for k, view in enumerate(views)]
 
 
-def test_a_constant_grade_is_the_world_and_a_changed_one_is_climbed() -> None:
+def test_only_a_change_of_grade_is_climbed() -> None:
     reckoning = DeadReckoning(CAMERA, memory_m=1e9)
     for k in range(1, 11):
         reckoning.advance(motion(k, SE2(1.0, 0.0, 0.0)))
@@ -119,7 +119,7 @@ def test_a_measured_motion_supersedes_the_coasted_ones() -> None:
     assert reckoning.T_world_ego.x_m == pytest.approx(3.9)
 
 
-def test_a_blind_camera_makes_a_chain_of_edges_that_ends_where_it_sees_again() -> None:
+def test_edges_chain_over_blind_frames() -> None:
     script = {1: motion(1, SE2(1.0, 0.0, 0.0))}
     script |= {k: motion(k, SE2(1.1 * (k - 1), 0.0, 0.0), since=k - 1) for k in range(2, 9)}  # coasted, all from 1
     script |= {9: motion(9, SE2(8.0, 0.0, 0.0), since=8), 10: motion(10, SE2(1.0, 0.0, 0.0))}
@@ -147,7 +147,7 @@ def test_an_unreadable_frame_has_a_status_and_no_edge() -> None:
     assert out[1].t_capture_ns == 5_001
 
 
-def test_vehicles_get_edges_when_confirmed_and_only_from_this_frames_boxes() -> None:
+def test_only_confirmed_vehicles_with_boxes_in_this_frame_have_edges() -> None:
     box = [550.0, 180.0, 650.0, 260.0]
     script = {k: motion(k, SE2(0.0, 0.0, 0.0)) for k in range(1, 6)}
     out = run(script, [seeing(box), seeing(box), seeing(box), seeing(box, age=1), seeing(box), seeing(box)])
@@ -160,14 +160,14 @@ def test_vehicles_get_edges_when_confirmed_and_only_from_this_frames_boxes() -> 
     assert (vv.from_frame, vv.to_frame) == (2, 4)
 
 
-def test_landmarks_are_the_near_corners_on_the_road() -> None:
+def test_landmarks_are_near_features_on_the_road() -> None:
     out = run({1: motion(1, SE2(1.0, 0.0, 0.0))}, [seeing(), seeing()])
     (landmark,) = out[1].cp  # one corner lies past the depth threshold, one above the horizon
     assert landmark.landmark == 7
     assert 8.0 < landmark.x_m < 10.0
 
 
-def test_lane_points_leave_out_what_a_vehicle_covers() -> None:
+def test_lane_points_exclude_vehicles() -> None:
     lane = np.zeros((375, 1242), bool)
     lane[230:350, 400:404] = lane[230:350, 800:804] = True
     (covered,) = run({}, [seeing([780.0, 200.0, 900.0, 370.0], lane=lane)])
@@ -176,7 +176,7 @@ def test_lane_points_leave_out_what_a_vehicle_covers() -> None:
     assert len(covered.lanes) <= 64
 
 
-def test_a_segmentation_that_comes_late_is_mapped_once_from_where_it_was_seen() -> None:
+def test_late_segmentation_is_mapped_once_at_its_own_pose() -> None:
     lane = np.zeros((375, 1242), bool)
     lane[230:350, 400:404] = True
     script = {k: motion(k, SE2(2.0, 0.0, 0.0)) for k in range(1, 4)}
@@ -202,7 +202,7 @@ def road_view() -> Ready:
     return Ready(Perception(nobody, masks, {"detector": 0, "segmenter": 0}, ()))
 
 
-def test_what_was_seen_before_a_way_of_unknown_length_is_dropped() -> None:
+def test_earlier_observations_are_dropped_after_motion_of_unknown_length() -> None:
     def seen(frames: int, *invalid: int) -> np.ndarray:
         steps = {k: motion(k, SE2(1.0, 0.0, 0.0)) for k in range(1, frames)}
         steps |= {k: msgspec.structs.replace(steps[k], status=(Status.SCALE_INVALID,)) for k in invalid}
@@ -216,7 +216,7 @@ def test_what_was_seen_before_a_way_of_unknown_length_is_dropped() -> None:
     assert seen(8).sum() > 1.2 * seen(5).sum()
 
 
-def test_lanes_keep_their_ids_until_the_world_begins_anew() -> None:
+def test_lanes_keep_ids_until_a_new_epoch() -> None:
     views = [road_view() for _ in range(25)]
     script = {k: motion(k, SE2(1.0, 0.0, 0.0)) for k in range(1, 25) if k != 18}
     out = run(script, views)
@@ -229,7 +229,7 @@ def test_lanes_keep_their_ids_until_the_world_begins_anew() -> None:
     assert sorted(sides[24].values()) == [-2, 3]
 
 
-def test_the_first_frame_says_that_nothing_is_known() -> None:
+def test_first_frame_is_not_initialised() -> None:
     (first,) = run({}, [seeing()])
     assert first.cc is None
     assert Status.NOT_INITIALISED in first.status

@@ -1,4 +1,4 @@
-"""A short run of `make fuzz`; and no file that is read can run code."""
+"""A short run of `make fuzz`; and no input file can execute code."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_the_same_seed_gives_the_same_cases() -> None:
 
 
 @pytest.mark.parametrize("package", ["birdslam", "runtime"])
-def test_nothing_that_is_read_is_run(package: str) -> None:
+def test_input_is_never_executed(package: str) -> None:
     """Files and messages are data: no module evaluates, imports by name, or unpickles."""
     for path in (ROOT / package).rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):

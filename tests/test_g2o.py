@@ -25,7 +25,7 @@ def lines(log: list[Measurements], weights: WeightsConfig = ALL_EDGES) -> list[l
     return [line.split() for line in g2o_lines(log, weights)]
 
 
-def test_gtsam_reads_it_and_finds_the_batchs_poses(tmp_path: Path) -> None:
+def test_gtsam_reads_the_file_and_finds_the_batch_poses(tmp_path: Path) -> None:
     log = [replace(m, cp=()) for m in LOG]
     path = tmp_path / "drive.g2o"
     path.write_text("\n".join(g2o_lines(log, ALL_EDGES)) + "\n")
@@ -51,7 +51,7 @@ def test_gtsam_reads_it_and_finds_the_batchs_poses(tmp_path: Path) -> None:
         np.testing.assert_allclose(*covs, rtol=1e-3, atol=1e-9)
 
 
-def test_landmarks_are_points_that_each_sight_ties() -> None:
+def test_each_observation_of_a_landmark_is_an_edge() -> None:
     found = lines(LOG, replace(ALL_EDGES, depth_threshold_m=None))
     sights = [line for line in found if line[0] == "EDGE_SE2_XY"]
     assert len(sights) == sum(len(m.cp) for m in LOG)
@@ -59,7 +59,7 @@ def test_landmarks_are_points_that_each_sight_ties() -> None:
     assert [float(n) for n in sights[0][5:]] == pytest.approx([400.0, 0.0, 400.0])  # 1 / (5 cm)^2
 
 
-def test_what_is_no_measurement_is_left_out() -> None:
+def test_invalid_edges_are_left_out() -> None:
     log = list(LOG)
     log[9] = replace(
         log[9], cv=(replace(log[9].cv[0], cov=(1.0, 9.0, 0.0, 9.0, 1.0, 0.0, 0.0, 0.0, 1.0)), *log[9].cv[1:])

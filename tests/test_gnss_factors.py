@@ -1,4 +1,4 @@
-"""Fixes as factors of the graph: jumps bend nothing, odometry's own bend goes; and where fixes come from."""
+"""Fixes as factors of the graph: jumps are rejected, drift of the odometry is corrected; sources of fixes."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def errors_m(found: OnEarth, nodes: list[Node], true: list[SE2]) -> np.ndarray:
     return np.hypot(east - [T.x_m for T in true], north - [T.y_m for T in true])
 
 
-def test_fixes_take_the_bend_out_of_odometry() -> None:
+def test_fixes_correct_odometry_drift() -> None:
     true, nodes, links = way(2000.0, seed=1)
     before = np.hypot(
         *(np.array([nodes[-1].T_map_keyframe.x_m, nodes[-1].T_map_keyframe.y_m]) - (true[-1].x_m, true[-1].y_m))
@@ -92,7 +92,7 @@ def test_fixes_take_the_bend_out_of_odometry() -> None:
     assert found.earth.outliers < 0.03 * found.earth.fixes
 
 
-def test_fixes_fifteen_metres_off_for_ten_seconds_are_left_out() -> None:
+def test_fixes_with_15_m_error_for_10_s_are_rejected() -> None:
     true, nodes, links = way(1200.0, seed=2)
     off = range(200, 226)  # ten seconds
     right = tied(true, nodes, links, fixes_of(true, 1.5))
@@ -101,7 +101,7 @@ def test_fixes_fifteen_metres_off_for_ten_seconds_are_left_out() -> None:
     assert errors_m(wrong, nodes, true).max() < errors_m(right, nodes, true).max() + 1.0
 
 
-def test_fixes_without_sense_are_refused() -> None:
+def test_invalid_fixes_are_refused() -> None:
     true, nodes, links = way(400.0, seed=3)
     chance = np.random.default_rng(1)
     scattered = [
@@ -120,7 +120,7 @@ def replaced(fix: GnssFix, latitude_deg: float, longitude_deg: float) -> GnssFix
     )
 
 
-def test_a_place_on_earth_is_within_its_covariance() -> None:
+def test_position_on_earth_is_within_its_covariance() -> None:
     """Over many drives, at their end, where it is worst."""
     inside = []
     for seed in range(12):
@@ -134,7 +134,7 @@ def test_a_place_on_earth_is_within_its_covariance() -> None:
     assert np.mean(inside) >= 0.9
 
 
-def test_a_map_seen_from_another_frame_is_at_the_same_place() -> None:
+def test_map_in_another_frame_has_the_same_position_on_earth() -> None:
     true, nodes, links = way(400.0, seed=4)
     earth = tied(true, nodes, links, fixes_of(true, 1.5)).earth
     T_other_map = SE2(30.0, -5.0, 0.7)
@@ -144,7 +144,7 @@ def test_a_map_seen_from_another_frame_is_at_the_same_place() -> None:
     assert earth.xy(earth.wgs84(p)) == pytest.approx(p, abs=1e-6)
 
 
-def test_what_is_written_opens_elsewhere(tmp_path: Path) -> None:
+def test_exports_open_in_other_programs(tmp_path: Path) -> None:
     true, nodes, _ = way(400.0, seed=5)
     poses = [(int(t_ns), node.T_map_keyframe) for t_ns, node in zip(times(len(nodes)), nodes, strict=True)]
     seen_from = [Place(t_ns, 0, T, T) for t_ns, T in poses]
@@ -158,7 +158,7 @@ def test_what_is_written_opens_elsewhere(tmp_path: Path) -> None:
 
 
 @pytest.mark.filterwarnings("error")
-def test_a_drive_without_places_has_nothing_beside_them(tmp_path: Path) -> None:
+def test_drive_without_keyframes_has_no_map_points(tmp_path: Path) -> None:
     write_places(tmp_path, [])
     assert write_around(tmp_path) == []
 
@@ -173,7 +173,7 @@ def peak_bytes_around(folder: Path) -> int:
         tracemalloc.stop()
 
 
-def test_what_lies_beside_a_drive_takes_memory_as_the_drive_is_long(tmp_path: Path) -> None:
+def test_memory_of_map_points_is_linear_in_length(tmp_path: Path) -> None:
     """Points and places both grow with it; of all pairs of them, half an hour was 76 GB."""
 
     def peak_bytes(length_m: int) -> int:
@@ -193,9 +193,7 @@ def test_what_lies_beside_a_drive_takes_memory_as_the_drive_is_long(tmp_path: Pa
     assert points[:4000:1000] == [[5.0 + k / 4.0, 2.0] for k in range(0, 4000, 1000)]
 
 
-def test_points_of_a_long_drive_are_brought_into_the_map_so_many_at_a_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_points_of_a_long_drive_are_transformed_in_chunks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """However many there are, they take the same memory."""
     monkeypatch.setattr(placed, "MAX_FEATURE_POINTS", 1000)
     write_places(tmp_path, [Place(0, 0, SE2(), SE2(5.0, 0.0, 0.0))])
@@ -215,7 +213,7 @@ def test_points_of_a_long_drive_are_brought_into_the_map_so_many_at_a_time(
     assert found == {epoch: [[5.0 + k, 2.0] for k in range(epoch, 16_100, 2)] for epoch in (0, 1)}
 
 
-def test_road_and_tracks_lie_beside_the_way_on_earth(tmp_path: Path) -> None:
+def test_road_and_tracks_are_beside_the_trajectory_on_earth(tmp_path: Path) -> None:
     """A line 2 m left of the way and a car 10 m ahead, by an odometry that bends away by metres."""
     true, nodes, _ = way(1500.0, seed=6)
     t_ns = [int(each) for each in times(len(nodes))]
@@ -263,7 +261,7 @@ def epoch(second: int, accuracy: str = "") -> bytes:
     return rmc + (sentence(accuracy) if accuracy else b"")
 
 
-def test_the_accuracy_of_a_fix_may_come_after_it() -> None:
+def test_accuracy_may_follow_its_fix() -> None:
     reader = NmeaReader()
     gst = "GPGST,120001.00,1.2,,,,3.0,4.0,5.0"
     gga = "GPGGA,120002.00,5103.000,N,11403.000,W,1,08,0.9,1045.4,M,,M,,"
@@ -284,7 +282,7 @@ def line() -> Iterator[tuple[int, str]]:
     os.close(theirs)
 
 
-def test_a_receiver_on_a_serial_line_is_heard(line: tuple[int, str]) -> None:
+def test_receiver_on_a_serial_line_is_read(line: tuple[int, str]) -> None:
     end, name = line
     receiver = Receiver(f"{name}@38400")
     heard: list[GnssFix] = []
@@ -309,7 +307,7 @@ def test_a_receiver_on_a_serial_line_is_heard(line: tuple[int, str]) -> None:
     assert receiver.refused == 1
 
 
-def test_what_is_no_serial_line_is_refused(tmp_path: Path) -> None:
+def test_non_serial_device_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="can't be opened"):
         Receiver("/dev/no-such-line")
     with pytest.raises(ConfigurationError, match="is not a serial line"):
@@ -318,7 +316,7 @@ def test_what_is_no_serial_line_is_refused(tmp_path: Path) -> None:
         Receiver("/dev/null@12345")
 
 
-def test_fixes_of_a_bag_bear_their_covariance(tmp_path: Path) -> None:
+def test_fixes_of_a_bag_have_their_covariance(tmp_path: Path) -> None:
     images = np.full((60, 80), 90, np.uint8)
     written = []
     for number in range(4):

@@ -1,4 +1,4 @@
-"""The drawn street with a grade: its geometry is what `python -m perf ground` calls true."""
+"""The synthetic street with a grade: its geometry matches its stated truth."""
 
 from __future__ import annotations
 

@@ -116,7 +116,7 @@ def wander(steps: int, step_m: float, sigma: float, rng: np.random.Generator) ->
     return error
 
 
-def test_a_lasting_scale_error_is_within_the_ego_covariance() -> None:
+def test_correlated_scale_error_is_within_ego_covariance() -> None:
     config, step_m, sigma, frames = SCALE_ALONE, 1.6, 0.02, 100
     rng = np.random.default_rng(3)
     ends = []
@@ -131,7 +131,7 @@ def test_a_lasting_scale_error_is_within_the_ego_covariance() -> None:
     assert last.cov[4] < 1e-3 * last.cov[0]  # to the side it does nothing
 
 
-def test_lasting_errors_of_direction_and_turn_are_within_the_ego_covariance() -> None:
+def test_correlated_direction_and_turn_errors_are_within_ego_covariance() -> None:
     config, step_m, turn_rad, frames = GraphConfig(), 1.6, 0.016, 40
     rng = np.random.default_rng(4)
     aside, turned = [], []
@@ -146,12 +146,12 @@ def test_lasting_errors_of_direction_and_turn_are_within_the_ego_covariance() ->
     assert 0.6 < np.mean(turned) < 1.5
 
 
-def test_of_an_odometry_that_is_no_cameras_nothing_lasts() -> None:
+def test_external_odometry_has_no_correlated_errors() -> None:
     last = run(chain([SE2(0.4, 0.0, 0.01)] * 100, 0.0), GraphConfig())[-1]
     assert max(last.cov) < 1e-5
 
 
-def test_an_error_of_the_scale_moves_everybody_alike() -> None:
+def test_scale_error_moves_all_bodies_alike() -> None:
     world = drive(DriveConfig(frames=60), seed=8)
     sure = run(world.measurements, GraphConfig())
     unsure = run([replace(m, scale_sigma_rel=0.05) for m in world.measurements], GraphConfig())
@@ -165,7 +165,7 @@ def test_an_error_of_the_scale_moves_everybody_alike() -> None:
 # --- where the world begins does not matter ---
 
 
-def test_a_long_way_before_changes_nothing_between_the_bodies() -> None:
+def test_earlier_distance_does_not_affect_relative_poses() -> None:
     world = drive(DriveConfig(frames=90), seed=21)
     far = 100_000
     first = world.measurements[0]
@@ -203,7 +203,7 @@ def test_a_long_way_before_changes_nothing_between_the_bodies() -> None:
 # --- epochs and gaps ---
 
 
-def test_no_motion_begins_a_new_epoch() -> None:
+def test_missing_motion_starts_a_new_epoch() -> None:
     world = drive(DriveConfig(frames=30, noise=0.0), seed=1)
     broken = list(world.measurements)
     broken[10] = replace(broken[10], cc=None, status=())
@@ -220,19 +220,19 @@ def test_no_motion_begins_a_new_epoch() -> None:
 @pytest.mark.parametrize(
     ("field", "value"), [("from_frame", 999), ("from_frame", 2), ("to_frame", 11), ("to_frame", 5)]
 )
-def test_a_motion_between_unknown_frames_begins_a_new_epoch(field: str, value: int) -> None:
+def test_motion_between_unknown_frames_starts_a_new_epoch(field: str, value: int) -> None:
     broken = drive(DriveConfig(frames=20), seed=1).measurements
     assert broken[10].cc is not None
     broken[10] = replace(broken[10], cc=replace(broken[10].cc, **{field: value}))
     assert [e.epoch for e in run(broken)] == [0] * 10 + [1] * 10
 
 
-def test_a_frame_that_came_before_begins_a_new_epoch() -> None:
+def test_falling_frame_number_starts_a_new_epoch() -> None:
     measurements = drive(DriveConfig(frames=10), seed=1).measurements
     assert [e.epoch for e in run([*measurements, measurements[4]])][-2:] == [0, 1]
 
 
-def test_an_edge_may_begin_at_any_pose_of_the_window() -> None:
+def test_edge_may_start_at_any_pose_of_the_window() -> None:
     world = drive(replace(NO_CP, frames=12, noise=0.0), seed=2)
     forked = list(world.measurements)
     motion = numbers(SE2(*world.ego[7]).between(SE2(*world.ego[10])))
@@ -247,7 +247,7 @@ def test_an_edge_may_begin_at_any_pose_of_the_window() -> None:
 
 
 @pytest.mark.parametrize("back", range(7))
-def test_how_far_back_an_edge_may_begin(back: int) -> None:
+def test_edge_start_is_limited_to_the_window(back: int) -> None:
     """The newest pose and the nodes before it are known, less the node whose place the newest takes."""
     world = drive(replace(NO_CP, frames=20, noise=0.0), seed=2)
     forked = list(world.measurements)
@@ -271,7 +271,7 @@ def test_a_vv_edge_from_an_unknown_pose_is_left_out() -> None:
 
 
 @pytest.mark.parametrize("status", [Status.END_OF_SOURCE, Status.FRAME_UNREADABLE])
-def test_a_frame_without_a_picture_repeats_the_pose_and_knows_it_less_well(status: Status) -> None:
+def test_frame_without_image_repeats_pose_with_larger_covariance(status: Status) -> None:
     world = drive(DriveConfig(frames=30), seed=6)
     blind = Measurements(
         frame_id=20, t_source_ns=world.measurements[20].t_source_ns, t_capture_ns=1, t_utc_ns=2, status=(status,)
@@ -291,7 +291,7 @@ def test_a_frame_without_a_picture_repeats_the_pose_and_knows_it_less_well(statu
     assert after.epoch == 0
 
 
-def test_a_frame_that_nobody_looked_at_is_told_by_the_last_motion() -> None:
+def test_skipped_frame_is_predicted_by_the_last_motion() -> None:
     world = drive(DriveConfig(frames=30), seed=6)
     last, ahead = world.measurements[19], world.measurements[23]
     coasts = Measurements(
@@ -306,7 +306,7 @@ def test_a_frame_that_nobody_looked_at_is_told_by_the_last_motion() -> None:
     assert all(t > b for t, b in zip(told.cov[::4], before.cov[::4], strict=True))
 
 
-def test_nothing_is_known_before_the_first_picture() -> None:
+def test_nothing_is_known_before_the_first_image() -> None:
     blind = Measurements(frame_id=0, t_source_ns=0, t_capture_ns=0, t_utc_ns=0, status=(Status.FRAME_UNREADABLE,))
     world = drive(DriveConfig(frames=5), seed=6)
     first, *others = run([blind, *(replace(m, frame_id=m.frame_id) for m in world.measurements)])
@@ -318,7 +318,7 @@ def test_nothing_is_known_before_the_first_picture() -> None:
 # --- vehicles ---
 
 
-def test_standstill_holds_still() -> None:
+def test_standstill_keeps_the_pose() -> None:
     world = drive(DriveConfig(frames=60, sigma_cc_m=0.05), seed=7)
     standing = [
         replace(m, cc=replace(m.cc, T_from_to=SE2()), status=(Status.STANDSTILL,)) if m.frame_id >= 30 and m.cc else m
@@ -329,7 +329,7 @@ def test_standstill_holds_still() -> None:
     np.testing.assert_allclose([e.cov for e in estimates[30:]], [estimates[30].cov] * 30, rtol=1e-9, atol=1e-15)
 
 
-def test_a_wild_detection_hardly_moves_a_vehicle() -> None:
+def test_outlier_detection_hardly_moves_a_vehicle() -> None:
     world = drive(replace(NO_CP, frames=80, vehicles=8), seed=8)
     wild = list(world.measurements)
     hit = wild[60].cv[0]
@@ -343,7 +343,7 @@ def test_a_wild_detection_hardly_moves_a_vehicle() -> None:
     assert np.hypot(*numbers(calm[60].T_world_ego.between(hurt[60].T_world_ego))[:2]) < 0.01
 
 
-def test_a_vehicle_out_of_sight_is_predicted_on_then_forgotten_then_new() -> None:
+def test_vehicle_out_of_sight_is_predicted_then_dropped_then_new() -> None:
     world = drive(replace(NO_CP, frames=200, vehicles=6), seed=3)
     last = next(e.vehicle for e in world.measurements[40].cv)
     hidden = [
@@ -364,7 +364,7 @@ def test_a_vehicle_out_of_sight_is_predicted_on_then_forgotten_then_new() -> Non
     assert mine[again].frames == 1
 
 
-def test_a_front_seen_where_the_back_was_does_not_throw_the_vehicle() -> None:
+def test_reversed_yaw_does_not_move_the_vehicle() -> None:
     world = drive(replace(NO_CP, frames=60, vehicles=6), seed=8)
     turned = [
         replace(m, cv=tuple(replace(e, T_ego_vehicle=e.T_ego_vehicle @ SE2(yaw_rad=3.1)) for e in m.cv))
@@ -405,7 +405,7 @@ def test_landmark_edges_sum_exactly_to_one_at_their_centroid(n: int, seed: int) 
     np.testing.assert_allclose(np.linalg.inv(C), np.linalg.inv(covs).sum(axis=0), rtol=1e-8)
 
 
-def test_what_landmarks_share_does_not_average_away() -> None:
+def test_shared_landmark_errors_do_not_average_out() -> None:
     """The covariance of the weighted centroid by what each errs by itself and by what all err by together."""
     rng = np.random.default_rng(0)
     A, S = rng.normal(size=(7, 2, 2)), rng.normal(size=(3, 7, 2))
@@ -453,7 +453,7 @@ def test_landmarks_never_make_the_ego_worse_than_cc_alone(common_error: bool) ->
     assert np.mean(with_cp) <= 1.01 * np.mean(without)
 
 
-def test_the_map_holds_what_was_seen() -> None:
+def test_map_has_the_observed_landmarks() -> None:
     world = drive(DriveConfig(frames=300, vehicles=0, noise=0.0, lane_points=4), seed=9)
     graph = PoseGraph(GraphConfig(), WeightsConfig())
     assert graph.map_update() is None
@@ -498,7 +498,7 @@ def test_lane_points_keep_their_lanes() -> None:
 
 
 @pytest.mark.slow
-def test_three_thousand_frames_grow_nothing() -> None:
+def test_memory_is_constant_over_3000_frames() -> None:
     world = drive(DriveConfig(frames=3000, vehicles=4, landmarks=6, outliers=0.02, drop=0.02), seed=10)
     config = GraphConfig(max_pending_landmarks=200, max_pending_frames=100)
     factors = standard_factors(config, WeightsConfig())
@@ -518,7 +518,7 @@ def test_three_thousand_frames_grow_nothing() -> None:
     assert len(gained.lanes_m) == 100 * DriveConfig().lane_points
 
 
-def test_no_more_vehicles_than_configured_the_freshest_stay() -> None:
+def test_max_vehicles_keeps_the_most_recent() -> None:
     world = drive(replace(NO_CP, frames=60, vehicles=9), seed=10)
     everyone, few = (run(world.measurements, GraphConfig(max_vehicles=n)) for n in (32, 3))
     assert max(len(e.vehicles) for e in everyone) > 3
@@ -599,7 +599,7 @@ NONSENSE = [
 
 @pytest.mark.parametrize("cov", NONSENSE)
 @pytest.mark.parametrize("T", [SE2(1.0, 2.0, 0.1), SE2(1e200, 0.0, 0.0), SE2(10.0, 0.0, 1e9)])
-def test_numbers_that_are_no_measurement_raise_nothing(cov: tuple[float, ...], T: SE2) -> None:
+def test_invalid_numbers_raise_nothing(cov: tuple[float, ...], T: SE2) -> None:
     world = drive(DriveConfig(frames=30, vehicles=4), seed=18)
     bad = list(world.measurements)
     bad[15] = replace(
@@ -697,7 +697,7 @@ def test_the_other_contenders_solve_the_same_world(kind: str) -> None:
             np.testing.assert_allclose(between(np.array([pose.x(), pose.y(), pose.theta()]), truth), 0.0, atol=1e-6)
 
 
-def test_landmarks_summed_for_gtsam_say_what_ours_say() -> None:
+def test_landmarks_summed_for_gtsam_match_ours() -> None:
     """One edge for all landmarks of two key frames: the ego is as well known as by our graph, and better than blind."""
     config = DriveConfig(frames=13, vehicles=0, landmarks=8, lane_points=0, noise=0.0, sigma_cp_m=0.01)
     log = [m if m.frame_id % 4 == 0 else replace(m, cp=()) for m in drive(config, seed=1).measurements]

@@ -1,4 +1,4 @@
-"""The road's tilt and vehicles' sizes from boxes that a known world projects."""
+"""Estimation of road tilt and vehicle sizes from boxes of a known world."""
 
 import copy
 import math
@@ -88,13 +88,13 @@ def test_boxes_alone_give_the_pitch_and_the_depths(pitch_rad: float) -> None:
         assert max(map(abs, level)) > 0.15
 
 
-def test_roll_shows_in_the_cars_left_and_right() -> None:
+def test_roll_is_estimated_from_cars_on_both_sides() -> None:
     road = Road(0.0, 0.02)
     traffic(road, 30, [1.5, 1.55, 1.5, 1.5, 1.55, 1.5])
     assert road.ground_size.ground.roll_rad > 0.003  # a kerb under each of them would do as well
 
 
-def test_vehicles_of_another_street_teach_the_roll_of_the_road_less_and_never_to_false_certainty() -> None:
+def test_vehicles_on_another_street_give_no_false_roll() -> None:
     """Three park aside on a street that lies higher; cars on the road itself are level."""
     rolls = []
     for sigma_rad in (CONFIG.sigma_common_crown_rad, 0.0):
@@ -109,7 +109,7 @@ def test_vehicles_of_another_street_teach_the_roll_of_the_road_less_and_never_to
     assert taught_rad > 2.0 * taught_sigma_rad  # as if all vehicles stood on one plane
 
 
-def test_the_tilt_and_the_sizes_are_as_sure_as_they_say() -> None:
+def test_tilt_and_sizes_are_consistent() -> None:
     """Over seeds, errors of the pitch against its sigma."""
     ratios = []
     for seed in range(12):
@@ -121,7 +121,7 @@ def test_the_tilt_and_the_sizes_are_as_sure_as_they_say() -> None:
     assert np.sqrt(np.mean(np.square(ratios))) < 1.5
 
 
-def test_errors_of_boxes_that_last_are_not_averaged_away() -> None:
+def test_correlated_box_errors_do_not_average_out() -> None:
     """A detector errs in a frame much as in the one before, three times as alike at 30 Hz as at 10 Hz."""
     ratios: list[float] = []
     for seed in range(8):
@@ -139,7 +139,7 @@ def test_errors_of_boxes_that_last_are_not_averaged_away() -> None:
     assert 0.6 < np.sqrt(np.mean(np.square(ratios))) < 1.2
 
 
-def test_a_faster_camera_learns_no_more_of_a_size_in_the_same_time() -> None:
+def test_frame_rate_does_not_add_size_information() -> None:
     sigmas = []
     for hz in (10.0, 30.0):
         road = Road()
@@ -150,7 +150,7 @@ def test_a_faster_camera_learns_no_more_of_a_size_in_the_same_time() -> None:
     assert sigmas[0] == pytest.approx(sigmas[1], rel=0.1)
 
 
-def test_a_box_cut_at_the_bottom_is_placed_by_what_was_learned() -> None:
+def test_box_truncated_below_uses_the_learned_size() -> None:
     road = Road()
     for x_m in np.arange(14.0, 8.4, -0.2):
         road.see({0: road.box(x_m, 0.5, 1.45), 1: road.box(x_m + 9.0, -3.0, 1.55)})
@@ -164,7 +164,7 @@ def test_a_box_cut_at_the_bottom_is_placed_by_what_was_learned() -> None:
     assert abs(math.log(depths[0] / near_m)) < 3.0 * sigmas[0]
 
 
-def test_one_wild_bottom_moves_neither_the_road_nor_the_size() -> None:
+def test_outlier_lower_edge_moves_neither_road_nor_size() -> None:
     road = Road()
     cars = {0: (14.0, 0.0, 1.5), 1: (22.0, 3.5, 1.45), 2: (30.0, -3.5, 1.55)}
     for _ in range(15):
@@ -178,7 +178,7 @@ def test_one_wild_bottom_moves_neither_the_road_nor_the_size() -> None:
     assert depths[0] == pytest.approx(14.0 - CAR.length_m / 2.0, rel=0.12)  # Eq. 1 says 30 % farther
 
 
-def test_the_camera_s_own_pitching_carries_the_horizon_through_a_bump() -> None:
+def test_camera_pitch_moves_the_horizon_over_a_bump() -> None:
     still, told = GroundSizeFilter(CAMERA, CONFIG), GroundSizeFilter(CAMERA, CONFIG)
     still.predict(0.1, 0.0, None, None)
     told.predict(0.1, 0.01, None, None)
@@ -188,7 +188,7 @@ def test_the_camera_s_own_pitching_carries_the_horizon_through_a_bump() -> None:
     assert abs(told.ground.pitch_rad) < 0.001  # it lasts: then the road has turned as well
 
 
-def test_the_images_pitch_is_taken_when_it_is_new() -> None:
+def test_pitch_from_images_is_used_once() -> None:
     ground_size = GroundSizeFilter(CAMERA, CONFIG)
     before = ground_size.sigma_pitch_rad
     ground_size.predict(0.1, 0.0, CAMERA.ground, IMAGE_COV)  # the calibration says nothing new
@@ -198,7 +198,7 @@ def test_the_images_pitch_is_taken_when_it_is_new() -> None:
     assert ground_size.sigma_pitch_rad < 0.5 * before
 
 
-def test_forgotten_vehicles_leave_what_they_said_of_the_road() -> None:
+def test_dropped_vehicles_keep_their_information_on_the_road() -> None:
     road = Road(0.015)
     traffic(road, 12, [1.5, 1.55, 1.5])
     pitch_rad, sigma_rad = road.ground_size.ground.pitch_rad, road.ground_size.sigma_pitch_rad
@@ -208,7 +208,7 @@ def test_forgotten_vehicles_leave_what_they_said_of_the_road() -> None:
     assert road.ground_size.size(0) == height
 
 
-def test_nothing_seen_is_nothing_learned() -> None:
+def test_without_boxes_nothing_is_estimated() -> None:
     ground_size = GroundSizeFilter(CAMERA, CONFIG)
     ground = ground_size.ground
     depths = ground_size.estimate_depths([], [], np.zeros(0), np.zeros(0), np.zeros(0))
@@ -216,7 +216,7 @@ def test_nothing_seen_is_nothing_learned() -> None:
     assert ground_size.ground == ground
 
 
-def test_parked_cars_are_seen_from_a_passing_ego_without_drift() -> None:
+def test_parked_cars_do_not_drift_as_the_ego_passes() -> None:
     """The filter's covariance stays positive over hundreds of frames and vehicles that come and go."""
     road = Road(0.005)
     for k in range(300):
@@ -229,7 +229,7 @@ def test_parked_cars_are_seen_from_a_passing_ego_without_drift() -> None:
     assert road.ground_size.ground.pitch_rad == pytest.approx(0.005, abs=0.004)
 
 
-def test_a_size_that_is_learned_elsewhere_counts_in_the_depth_and_is_not_kept() -> None:
+def test_external_size_corrects_depth_and_is_not_stored() -> None:
     road = Road()
     box = {0: road.box(40.0, 0.0, 1.7)}
     (prior_m,), (prior_sigma,) = (list(x.values()) for x in road.see(box))
@@ -261,7 +261,7 @@ def test_a_size_that_is_learned_elsewhere_counts_in_the_depth_and_is_not_kept() 
 
 
 @pytest.mark.parametrize("speed_mps", [0.0, 15.0])
-def test_a_box_that_widens_is_of_a_car_that_turns_or_of_one_that_comes_nearer(speed_mps: float) -> None:
+def test_widening_box_means_turning_or_approaching_car(speed_mps: float) -> None:
     """What stands shows no other side but by the ego's way, so that its width counts; who drives may turn."""
     road = Road()
     motion = LearnedSize(
@@ -296,13 +296,13 @@ def crest_errors(vertical_per_m: float, given: VerticalCurvature | None) -> list
     return out
 
 
-def test_vehicles_before_a_crest_stand_on_the_road_that_falls_away() -> None:
+def test_vehicles_before_a_crest_are_on_the_falling_road() -> None:
     crest = VerticalCurvature(-0.002, 2e-4)
     assert min(crest_errors(crest.per_m, None)) < -0.15, "a plane puts them much too near"
     assert max(abs(error) for error in crest_errors(crest.per_m, crest)) < 0.05
 
 
-def test_boxes_do_not_correct_the_vertical_curvature_and_suffer_from_its_error() -> None:
+def test_curvature_error_enters_boxes_but_boxes_do_not_correct_it() -> None:
     sigma: dict[float, float] = {}
     for own in (1e-5, 1e-3):
         road, crest = Road(), VerticalCurvature(-0.002, own)
@@ -315,7 +315,7 @@ def test_boxes_do_not_correct_the_vertical_curvature_and_suffer_from_its_error()
     assert sigma[1e-3] > 1.01 * sigma[1e-5]
 
 
-def test_a_hill_is_believed_and_a_small_bend_is_not() -> None:
+def test_only_significant_curvature_is_used() -> None:
     hill, hill_var = estimate_curvature(VerticalCurvature(0.002, 2e-4), 1.5e-4, 6.0)
     small, small_var = estimate_curvature(VerticalCurvature(1.5e-4, 2e-4), 1.5e-4, 6.0)
     assert hill > 0.0018

@@ -1,4 +1,4 @@
-"""What a yaw that is not known makes of a vehicle's place, on boxes that a known world projects."""
+"""The effect of an unknown yaw on a vehicle's position, on boxes of a known world."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def thought(yaw_rad: float, sigma_rad: float, outlier: float) -> YawPrior:
 
 
 @pytest.mark.parametrize("yaw_rad", [-1.0, 0.0, 0.5, 2.0])
-def test_a_yaw_that_is_known_moves_nothing(yaw_rad: float) -> None:
+def test_known_yaw_changes_nothing(yaw_rad: float) -> None:
     seen, depth_m = car_at(np.array([15.0, 3.0]), yaw_rad, np.zeros(4))
     (centre, cov), (mean, wide) = placed(seen, depth_m, thought(yaw_rad, 0.0, 0.0))
     np.testing.assert_allclose(mean, centre, atol=1e-9)
@@ -65,7 +65,7 @@ def test_the_papers_point_is_the_same_for_every_yaw() -> None:
     np.testing.assert_allclose(wide, cov, atol=1e-9)
 
 
-def test_a_wide_box_is_of_a_car_that_stands_across() -> None:
+def test_wide_box_is_a_crossing_car() -> None:
     """Its centre lies half of its width behind the nearest face; one turned by 60 degrees looks nearly as wide."""
     truth = np.array([15.0, 0.0])
     seen, depth_m = car_at(truth, math.pi / 2.0, np.zeros(4))
@@ -74,7 +74,7 @@ def test_a_wide_box_is_of_a_car_that_stands_across() -> None:
     assert abs(mean[0] - truth[0]) < 0.7
 
 
-def test_the_covariance_holds_cars_that_stand_as_they_like() -> None:
+def test_covariance_covers_any_yaw() -> None:
     """A quarter is headed anywhere, as `HeadingConfig` has it, and the place is told for one headed like the ego."""
     rng, squared = np.random.default_rng(2), []
     for _ in range(600):
@@ -97,13 +97,13 @@ def test_the_covariance_holds_cars_that_stand_as_they_like() -> None:
 )
 @pytest.mark.parametrize("x_m", [12.0, 25.0, 45.0])
 @pytest.mark.parametrize("y_m", [-5.0, 0.0, 5.0])
-def test_a_box_shows_who_stands_across_the_road(yaw_rad: float, first: float, x_m: float, y_m: float) -> None:
+def test_box_determines_crossing_cars(yaw_rad: float, first: float, x_m: float, y_m: float) -> None:
     seen, _ = car_at(np.array([x_m, y_m]), yaw_rad, np.zeros(4))
     assert initial_yaw_rad(seen, CONFIG) == first
     assert initial_yaw_rad(seen, HeadingConfig(across=0.0)) == 0.0
 
 
-def test_a_wide_box_that_the_border_cuts_shows_nothing_of_the_yaw() -> None:
+def test_truncated_box_does_not_determine_yaw() -> None:
     box = np.array([[2.0, 150.0, 402.0, 300.0]])
     (cut,) = observe_boxes(box, np.ones(1), ("car",), CAMERA, CAMERA.ground, LOCALISATION)
     (whole,) = observe_boxes(box + [400.0, 0.0] * 2, np.ones(1), ("car",), CAMERA, CAMERA.ground, LOCALISATION)

@@ -1,4 +1,4 @@
-"""Budgets, what a node measures of itself, its scheduling, and the check of the machine."""
+"""Budgets, health of a node, scheduling, and the check of the machine."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ from tests.recordings import SMALL as CAMERA
 MS = 1_000_000
 
 
-def test_parts_over_the_whole_are_refused_by_name(tmp_path: Path) -> None:
+def test_budgets_over_the_total_are_refused_by_name(tmp_path: Path) -> None:
     path = tmp_path / "a.toml"
     path.write_text("[budgets]\nperceive_ms = 120\n")
     with pytest.raises(ConfigurationError, match=r"budgets: capture_ms .* perceive_ms .* = 170 is over end_to_end_ms"):
@@ -71,7 +71,7 @@ def test_no_frame_waits_longer_for_networks_than_perceive_may_take() -> None:
 
 
 @given(st.lists(st.floats(1.0, 60.0), min_size=6, max_size=6), st.floats(1.0, 300.0))
-def test_budgets_load_exactly_where_they_add_up(parts: list[float], whole: float) -> None:
+def test_budgets_load_if_they_add_up(parts: list[float], whole: float) -> None:
     names = [name for name in BudgetsConfig.__struct_fields__ if name not in ("percentile", "end_to_end_ms")]
     tree = {f"budgets.{name}": value for name, value in zip(names, parts, strict=True)}
     tree |= {"budgets.end_to_end_ms": whole, "perceive.deadline_ms": 1.0}
@@ -88,7 +88,7 @@ def test_every_node_has_a_budget_and_a_scheduling() -> None:
         assert RealtimeConfig().of(node).priority > 0
 
 
-def test_what_is_recent_is_forgotten_in_time() -> None:
+def test_recent_values_expire() -> None:
     recent = Recent(span_s=1.0)
     for number in range(100):
         recent.add(100.0, number * 10 * MS)
@@ -128,7 +128,7 @@ def test_a_node_s_health() -> None:
     assert stale.rate_hz == 0.0
 
 
-def test_what_is_left_of_the_budget_stays_with_the_trace() -> None:
+def test_remaining_budget_is_kept_in_the_trace() -> None:
     trace = Trace((Stage("optimize", 1, 2),), left_ns=-5).sent(9, 3)
     assert trace == Trace((Stage("optimize", 1, 2, 9),), left_ns=-5, number=3)
     assert decode(encode(Trace((Stage("n", 1, 2, 3),))), Trace).left_ns is None
@@ -138,12 +138,12 @@ def scheduled(**settings: object) -> Configuration:
     return Configuration(source=SourceConfig(uri="kitti:x"), realtime=RealtimeConfig(**settings))  # type: ignore[arg-type]
 
 
-def test_a_recording_asks_for_nothing() -> None:
+def test_recording_needs_no_permissions() -> None:
     assert list(realtime.apply("perceive", scheduled())) == []
     assert Configuration(source=SourceConfig(uri="v4l2:/dev/video0")).live
 
 
-def test_what_is_not_permitted_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_permission_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*arguments: object) -> None:
         raise PermissionError(1, "Operation not permitted")
 
@@ -159,7 +159,7 @@ def test_what_is_not_permitted_is_a_line(monkeypatch: pytest.MonkeyPatch) -> Non
     ]
 
 
-def test_a_node_runs_where_it_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_node_runs_on_its_configured_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[tuple[int, tuple[int, ...]]] = []
     monkeypatch.setattr(os, "sched_setaffinity", lambda thread, cpus: asked.append((thread, cpus)))
     monkeypatch.setattr(os, "sched_setscheduler", lambda *of: None)
@@ -171,7 +171,7 @@ def at_rate(hz: float) -> Configuration:
     return msgspec.structs.replace(scheduled(), perceive=PerceiveConfig(period_ms=1e3 / hz))
 
 
-def test_who_computes_little_goes_before_networks(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_light_nodes_have_priority_over_networks(monkeypatch: pytest.MonkeyPatch) -> None:
     by_fifo: list[int] = []
     nice: list[int] = []
     monkeypatch.setattr(os, "sched_setscheduler", lambda thread, policy, param: by_fifo.append(param.sched_priority))
@@ -186,7 +186,7 @@ def test_who_computes_little_goes_before_networks(monkeypatch: pytest.MonkeyPatc
     assert list(realtime.apply("optimize", at_rate(33.0))) == []
 
 
-def test_of_perceive_the_frames_go_before_the_networks(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_of_perceive_have_priority_over_networks(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[tuple[int, int]] = []
     slices: list[tuple[list[int], int]] = []
     own, usual = threading.get_native_id(), os.getpriority(os.PRIO_PROCESS, 0)
@@ -237,9 +237,7 @@ def test_a_thread_gets_a_short_slice_and_keeps_its_nice_value() -> None:
 
 
 @pytest.mark.parametrize("configuration", [scheduled(), at_rate(1000.0)])
-def test_a_flood_of_frames_takes_no_core_for_good(
-    configuration: Configuration, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_flood_of_frames_does_not_block_a_core(configuration: Configuration, monkeypatch: pytest.MonkeyPatch) -> None:
     nice: list[int] = []
     monkeypatch.setattr(os, "sched_setscheduler", lambda *of: pytest.fail("SCHED_FIFO at a rate without a bound"))
     monkeypatch.setattr(os, "setpriority", lambda which, thread, value: nice.append(value))
@@ -256,7 +254,7 @@ def test_at_rate_max_no_real_time_priority_is_set(monkeypatch: pytest.MonkeyPatc
     assert asked == []
 
 
-def test_a_spare_loads_below_all_others_and_comes_back() -> None:
+def test_spare_loads_at_low_priority_and_restores_it() -> None:
     policy = os.sched_getscheduler(0)
     with subprocess.Popen(["sleep", "600"], start_new_session=True) as process:
         group = Path(f"/proc/{process.pid}/autogroup")
@@ -274,7 +272,7 @@ def test_a_spare_loads_below_all_others_and_comes_back() -> None:
     realtime.raise_from_idle(process.pid)  # it has ended: nothing to do
 
 
-def test_who_may_not_come_back_is_not_sent_there(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_priority_is_not_lowered_without_permission_to_restore(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(resource, "getrlimit", lambda which: (0, 0))
     monkeypatch.setattr(realtime, "has_capability", lambda capability: False)
     monkeypatch.setattr(os, "sched_setscheduler", lambda *of: pytest.fail("it was"))
@@ -332,7 +330,7 @@ def refused(*arguments: object) -> None:
     raise PermissionError
 
 
-def test_the_doctor_finds_what_is_wrong(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doctor_reports_problems(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rt = RuntimeConfig(runtime_dir=str(tmp_path / "rt"))
     healthy = Configuration(
         vehicle="doc",
@@ -386,7 +384,7 @@ def test_the_doctor_counts_the_cores_of_its_control_group(tmp_path: Path) -> Non
     assert quota(tmp_path) == float("inf")
 
 
-def test_a_full_disk_costs_lines_not_the_drive() -> None:
+def test_full_disk_costs_only_log_lines() -> None:
     with open("/dev/full", "w") as full:
         live = LiveLine(full)
         live.say("a line")
@@ -510,7 +508,7 @@ print(faults)
 
 
 @pytest.mark.processes
-def test_what_a_drive_fills_can_be_reserved() -> None:
+def test_disk_space_can_be_reserved() -> None:
     """Some 8 MiB of objects and a table of 2, made by a thread after the start."""
     plain, reserved = (
         int(subprocess.run([sys.executable, "-c", _RESERVED, how], capture_output=True, check=True).stdout)
@@ -549,7 +547,7 @@ with Inference(configuration) as inference:
 
 
 @pytest.mark.processes
-def test_what_perceive_makes_at_work_fits_into_what_it_reserves() -> None:
+def test_allocations_of_perceive_fit_its_reserve() -> None:
     """Six seconds of the shipped drive; by what did not fit perceive grew for a quarter of an hour, burst by burst."""
     if platform.libc_ver()[0] != "glibc":
         pytest.skip("these are glibc's settings")
@@ -574,7 +572,7 @@ print(sys.getallocatedblocks() - before)
 
 
 @pytest.mark.processes
-def test_what_python_keeps_of_freed_tuples_is_there_from_the_start() -> None:
+def test_free_lists_are_filled_at_start() -> None:
     """Its store fills in the first half hour else, and looks like a leak."""
     if platform.python_implementation() != "CPython":
         pytest.skip("another Python keeps other things")

@@ -85,9 +85,7 @@ def test_a_frame_continues_once_its_awaited_networks_have_answered(made: Made) -
         assert perception.status == (Status.SEGMENTATION_CARRIED,)
 
 
-def test_a_frame_waits_no_longer_than_what_comes_after_leaves_of_its_budget(
-    made: Made, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_wait_is_limited_by_the_remaining_budget(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
     clock_ns = [10**12]
     monkeypatch.setattr(inference.time, "monotonic_ns", lambda: clock_ns[0])
     monkeypatch.setattr(inference, "wait", lambda awaited, timeout: waited_s.append(timeout))
@@ -114,7 +112,7 @@ def test_rate_max_awaits_all(made: Made) -> None:
         assert perception.status == ()
 
 
-def test_what_runs_aside_begins_when_its_frame_is_over(made: Made) -> None:
+def test_background_work_starts_after_its_frame(made: Made) -> None:
     detector, segmenter = Gated("detector"), Gated("segmenter")
     with made(detector, segmenter, 1.0) as networks:
         aside = networks.run_in_background
@@ -131,7 +129,7 @@ def test_what_runs_aside_begins_when_its_frame_is_over(made: Made) -> None:
     assert last.done()
 
 
-def test_what_runs_aside_lets_each_further_frame_pass(made: Made) -> None:
+def test_background_work_yields_to_frames(made: Made) -> None:
     with made(Gated("detector"), Gated("segmenter"), 1.0) as networks:
         first, second = threading.Event(), threading.Event()
 
@@ -155,7 +153,7 @@ def test_what_runs_aside_lets_each_further_frame_pass(made: Made) -> None:
         assert second.is_set()
 
 
-def test_at_rate_max_nothing_runs_aside(made: Made) -> None:
+def test_at_rate_max_there_is_no_background_work(made: Made) -> None:
     detector, segmenter = Gated("detector"), Gated("segmenter")
     with made(detector, segmenter, 1.0, rate="max") as networks:
         assert networks.run_in_background is None

@@ -1,4 +1,4 @@
-"""The first motion: searched for over rotation and length, refined from the guess; what stands still in the image."""
+"""The first motion: a search over rotation and length, then refinement; features fixed in the image."""
 
 import itertools
 from pathlib import Path
@@ -83,13 +83,13 @@ def test_the_first_motion_is_found_without_a_guess(
     assert np.linalg.norm(driven.p) == pytest.approx(np.linalg.norm(step.p), rel=0.2)
 
 
-def test_of_two_images_alike_the_search_says_that_nothing_turned(plain: Plain, search: MotionInitialiser) -> None:
+def test_identical_images_give_no_rotation(plain: Plain, search: MotionInitialiser) -> None:
     image = plain.render(Pose(np.eye(3), np.zeros(3)))
     assert np.abs(search.search_rotation(image, image) - np.eye(3)).max() < 1e-9
     assert np.abs(search.search_rotation(np.zeros_like(image), image) - np.eye(3)).max() < 1e-9  # no texture
 
 
-def test_a_guided_two_view_holds_where_most_matches_are_far_or_wrong() -> None:
+def test_guided_two_view_tolerates_far_and_wrong_matches() -> None:
     rng = np.random.default_rng(1)
     step = _step(2.7, 1.0)
     depth = np.concatenate([rng.uniform(60.0, 300.0, 150), rng.uniform(6.0, 20.0, 40)])
@@ -110,7 +110,7 @@ def test_a_guided_two_view_holds_where_most_matches_are_far_or_wrong() -> None:
     )  # a guess without a direction
 
 
-def test_corners_that_move_backwards_along_their_lines_say_nothing_of_the_first_pose() -> None:
+def test_features_with_reversed_parallax_do_not_affect_the_first_pose() -> None:
     """They lie on the lines of the true motion, and no line tells them from the good: only the way along it does."""
     rng = np.random.default_rng(2)
     step = _step(0.4, 1.3)
@@ -136,7 +136,7 @@ def test_corners_that_move_backwards_along_their_lines_say_nothing_of_the_first_
         ([[0.2, 0.1, 0.1], [0.2, 0.1, 0.25]], 0.05),  # what may be chance
     ],
 )
-def test_what_stands_is_no_road_where_what_changed_moves(changed: list[list[float]], found_m: float) -> None:
+def test_static_pixels_are_not_road_if_changed_pixels_move(changed: list[list[float]], found_m: float) -> None:
     lengths = np.array([0.05, 1.0, 2.0])
     whole = [[0.6, 0.2, 0.3], [0.8, 0.2, 0.3]]
     pitch, length = best_correlation(lambda half: np.array(changed if half else whole), lengths)
@@ -144,7 +144,7 @@ def test_what_stands_is_no_road_where_what_changed_moves(changed: list[list[floa
     assert pitch == 1
 
 
-def test_what_changed_is_not_asked_where_the_whole_road_moves() -> None:
+def test_changed_pixels_are_not_needed_if_the_road_moves() -> None:
     asked: list[bool] = []
 
     def alike(half: bool) -> np.ndarray:
@@ -155,7 +155,7 @@ def test_what_changed_is_not_asked_where_the_whole_road_moves() -> None:
     assert asked == [False]
 
 
-def test_what_changed_is_looked_for_on_the_farther_road() -> None:
+def test_changed_pixels_are_taken_from_the_farther_road() -> None:
     past = RoadImage.from_normalised(np.zeros((8, 8), np.float32), 4)
     present = RoadImage.from_normalised(np.zeros((8, 8), np.float32), 4)
     present.grey[1:3] = [[5.0], [-6.0]]  # rows 5 and 6 of the image
@@ -165,7 +165,7 @@ def test_what_changed_is_looked_for_on_the_farther_road() -> None:
     assert sorted({tuple(one) for one in shown.tolist()}) == sorted((u, v) for v in (5, 6) for u in range(8))
 
 
-def test_of_a_road_of_one_row_nothing_is_farther() -> None:
+def test_road_of_one_row_has_no_farther_part() -> None:
     image = RoadImage.from_normalised(np.zeros((1, 8), np.float32), 4)
     assert len(far_changed_pixels(image, image, np.array([[u, 4] for u in range(8)]))) == 0
 
@@ -230,7 +230,7 @@ def test_a_wrong_pitch_of_the_camera_file_is_reported_on_a_bare_motorway(data_di
     assert (Status.CALIBRATION_DRIFT in seen[-1].status) == (pitch_deg == 2.0)
 
 
-def test_a_road_sample_strip_bends_with_the_way() -> None:
+def test_road_samples_follow_the_trajectory() -> None:
     aligner = RoadAligner(CAMERA, RoadAlignConfig())
     for bend_per_m in (-0.05, 0.05):
         px = aligner.samples((0.0, 0.0), NO_BOXES, None, bend_per_m)

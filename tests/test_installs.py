@@ -1,4 +1,4 @@
-"""What can be installed, and where: the Pythons of the package, the Containerfile, the browser of the tests."""
+"""Installation: Python versions of the package, the Containerfile, the browser of the tests."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ PYTHONS = ("3.11", "3.12", "3.13")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
-def test_the_package_says_on_which_pythons_it_runs() -> None:
+def test_package_states_its_python_versions() -> None:
     told = re.findall(r"Python :: (3\.\d+)", " ".join(PROJECT["classifiers"]))
     assert tuple(told) == PYTHONS
     assert PROJECT["requires-python"] == f">={PYTHONS[0]}"
 
 
-def test_the_containerfile_is_one() -> None:
+def test_containerfile_is_valid() -> None:
     steps = containerfile.instructions()
     names = [step.name for step in steps]
     assert set(names) <= set(containerfile.KNOWN)
@@ -60,7 +60,7 @@ def test_the_containerfile_is_one() -> None:
         (0, 100, "no Chromium: tests of pages in a browser skip"),  # as where there is no network
     ],
 )
-def test_root_installs_a_browser_and_others_are_told(tmp_path: Path, user: int, apt_status: int, says: str) -> None:
+def test_only_root_installs_a_browser(tmp_path: Path, user: int, apt_status: int, says: str) -> None:
     """On a machine without one; whatever comes of it, the tests run."""
     make, shell = shutil.which("make"), shutil.which("sh")
     assert make is not None

@@ -1,4 +1,4 @@
-"""The interface page is what the code says, and its examples run against a real drive."""
+"""The interface page matches the code, and its examples run on a real drive."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def test_the_examples_against_a_drive(tmp_path_factory: pytest.TempPathFactory) 
             until_said(plain, r"stale: no estimate")
 
 
-def test_the_examples_are_short_and_the_plain_one_needs_nothing_of_ours() -> None:
+def test_examples_are_short_and_the_plain_one_needs_no_birdslam() -> None:
     code = (EXAMPLES / "planner.py").read_text()
     assert len(code.splitlines()) <= 30
     plain = (EXAMPLES / "plain.py").read_text()

@@ -1,4 +1,4 @@
-"""Entries for systemd's journal, read back from a socket in its place."""
+"""Entries for systemd's journal, read back from a socket."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ def test_an_entry_has_its_fields_and_lines(reader: tuple[socket.socket, str]) ->
     assert entry(end) == {"MESSAGE": "two\nlines = 2", **expected}
 
 
-def test_a_journal_that_is_gone_stops_nothing(tmp_path: Path) -> None:
+def test_missing_journal_does_not_stop_the_run(tmp_path: Path) -> None:
     Journal(str(tmp_path / "none")).send("lost", Priority.INFO)
 
 
-def test_the_journal_is_used_where_it_is_behind_the_stream(tmp_path: Path) -> None:
+def test_journal_is_used_if_the_stream_is_connected_to_it(tmp_path: Path) -> None:
     with (tmp_path / "out").open("w") as stream:
         state = os.fstat(stream.fileno())
         assert journal_of(stream, {"JOURNAL_STREAM": f"{state.st_dev}:{state.st_ino}"}) is not None
@@ -61,7 +61,7 @@ def test_the_journal_is_used_where_it_is_behind_the_stream(tmp_path: Path) -> No
     assert journal_of(sys.stdout, {}) is None
 
 
-def test_what_a_node_says_is_a_warning_of_that_node(
+def test_output_of_a_node_is_its_warning(
     reader: tuple[socket.socket, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     end, address = reader

@@ -73,7 +73,7 @@ def test_an_undisturbed_drive_is_valid_and_right(drive: list[Estimate]) -> None:
     assert judged(drive).wrong == 0
 
 
-def test_a_pose_that_jumps_is_wrong_unless_it_says_so(drive: list[Estimate]) -> None:
+def test_pose_jump_without_new_epoch_is_wrong(drive: list[Estimate]) -> None:
     """At the end of the drive: marked valid, told as unsure, told as invalid."""
     driven_m = (FRAMES - SETTLED) * street.FRAME_M
     jump = SE2(0.3 * driven_m + 5.0, 0.0, 0.0)

@@ -1,4 +1,4 @@
-"""The scale of the window of keyframes: no image says anything of it, so nothing may move it."""
+"""The scale of the keyframe window: images do not determine it, so it must not drift."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def unit_of_length(seed: int, way_m: float, sigma_px: float) -> Floats:
     return np.array(ways_m) / (3 * STEP_M)
 
 
-def test_the_unit_of_length_walks_no_faster_than_the_road_filter_is_told() -> None:
+def test_scale_drifts_no_faster_than_stated_to_the_road_filter() -> None:
     """Over 60 m of 4 streets: the root mean square of what it walked, in which a drift to one side would show too."""
     way_m, walked = 60.0, []
     for seed in range(4):
@@ -61,7 +61,7 @@ def test_the_unit_of_length_walks_no_faster_than_the_road_filter_is_told() -> No
 
 
 @given(st.sets(st.integers(0, 40)), st.sets(st.integers(0, 40)))
-def test_common_ids_stand_where_numpy_finds_them(a: set[int], b: set[int]) -> None:
+def test_common_ids_match_numpy(a: set[int], b: set[int]) -> None:
     first, second = (np.array(sorted(ids), dtype=np.int64) for ids in (a, b))
     _, at_first, at_second = np.intersect1d(first, second, return_indices=True)
     found = match_ids(first, second)
@@ -70,5 +70,5 @@ def test_common_ids_stand_where_numpy_finds_them(a: set[int], b: set[int]) -> No
 
 
 @given(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=30), st.floats(0.0, 1.0))
-def test_a_quantile_is_that_of_numpy(values: list[float], share: float) -> None:
+def test_quantile_matches_numpy(values: list[float], share: float) -> None:
     assert quantile(np.array(values), share) == pytest.approx(float(np.quantile(values, share)), abs=1e-9)

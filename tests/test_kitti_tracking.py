@@ -13,7 +13,7 @@ from birdslam.sources.recording import DatasetError
 from tests import tracking_world
 
 
-def test_oxts_and_pose_rows_say_the_same(tmp_path: Path) -> None:
+def test_oxts_and_pose_rows_agree(tmp_path: Path) -> None:
     by_rows = open_tracking(tracking_world.write(tmp_path / "a"), "0002")
     by_oxts = open_tracking(tracking_world.write(tmp_path / "b", with_oxts=True), "0002")
     np.testing.assert_allclose(by_oxts.poses, by_rows.poses, atol=1e-6)
@@ -32,7 +32,7 @@ def test_truth_is_seen_from_the_first_frame(tmp_path: Path) -> None:
     assert truth.yaw_rad == pytest.approx(0.0, abs=1e-9)
 
 
-def test_camera_2_stands_beside_camera_0(tmp_path: Path) -> None:
+def test_camera_2_is_beside_camera_0(tmp_path: Path) -> None:
     root = tracking_world.write(tmp_path)
     path = root / "calib" / "0002.txt"
     path.write_text(path.read_text().replace(f"{tracking_world.CX} 0 0", f"{tracking_world.CX} 43.3 0", 1))
@@ -45,9 +45,7 @@ def test_camera_2_stands_beside_camera_0(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("focal_px", "size_px"), [(721.5377, (1242, 375)), (707.0493, (1224, 370)), (718.856, (1241, 376))]
 )
-def test_images_that_are_not_there_have_the_size_of_their_day(
-    tmp_path: Path, focal_px: float, size_px: tuple[int, int]
-) -> None:
+def test_missing_images_have_the_size_of_their_day(tmp_path: Path, focal_px: float, size_px: tuple[int, int]) -> None:
     root = tracking_world.write(tmp_path)
     path = root / "calib" / "0002.txt"
     path.write_text(path.read_text().replace(str(tracking_world.FX), str(focal_px)))

@@ -1,4 +1,4 @@
-"""Labels in a camera that they were not drawn in: the right colour camera's images are as good as the left one's."""
+"""Labels projected into another camera: the right colour camera's images are as good as the left one's."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_boxes_are_where_the_camera_sees_the_cars(tmp_path: Path) -> None:
         assert label.truncated == 0
 
 
-def test_what_leaves_the_image_is_truncated_or_gone(tmp_path: Path) -> None:
+def test_labels_outside_the_image_are_truncated_or_dropped(tmp_path: Path) -> None:
     right = open_tracking(with_right_camera(tmp_path), "0002")
     label, T = right.labels_of(0)[0], right.T_cam0_camera
 

@@ -1,4 +1,4 @@
-"""Bodies of a network held to labels: what is compared with what, and the shipped network's stated sigmas."""
+"""Network bodies compared with labels: the matching, and the shipped network's stated sigmas."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def found(alpha_rad: float, length_m: float) -> Detections:
     return Detections(np.array([BOX]), np.array([0.9]), ("car",), body)
 
 
-def test_a_body_is_held_to_the_label_that_its_box_is_of() -> None:
+def test_body_is_compared_with_the_label_of_its_box() -> None:
     ((of, row),) = errors(found(0.1, 4.4), [label()], CAMERA, np.eye(4))
     assert of.track == 3
     assert (row[DEPTH], row[OFF], row[CUT]) == pytest.approx((20.0, 0.1, 0.0))
@@ -51,7 +51,7 @@ def test_a_body_is_held_to_the_label_that_its_box_is_of() -> None:
     assert not errors(found(0.1, 4.4), [label("Pedestrian")], CAMERA, np.eye(4))
 
 
-def test_headings_count_by_sight_and_sizes_by_vehicle() -> None:
+def test_headings_count_per_observation_and_sizes_per_vehicle() -> None:
     sights = [(0.0, 4.0), (math.pi, 4.8), (0.5, 4.4)]
     rows = [errors(found(*sight), [label()], CAMERA, np.eye(4))[0][1] for sight in sights]
     row = summary(np.array(rows), np.array(["a", "a", "b"]))

@@ -1,4 +1,4 @@
-"""CP edges of lanes: the same landmark wherever it is seen from, sure across the lane, silent along it, honest."""
+"""CP edges of lanes: invariant to the viewpoint, observable across the lane only, consistent."""
 
 from __future__ import annotations
 
@@ -38,9 +38,7 @@ def found(T_world_ego: SE2, points_ego_m: Floats, lane: int = 3) -> list[Station
 
 
 @given(st.floats(-math.pi, math.pi), st.floats(-4.0, 4.0), st.floats(0.0, 6.0))
-def test_a_station_is_the_same_point_of_the_world_whoever_sees_it(
-    yaw_rad: float, aside_m: float, step_m: float
-) -> None:
+def test_station_is_the_same_world_point_from_any_pose(yaw_rad: float, aside_m: float, step_m: float) -> None:
     world = SE2(3.0, -2.0, yaw_rad) @ line(0.0, aside_m, 0.0, 40.0)
     seen = {}
     for at in (SE2(3.0, -2.0, yaw_rad), SE2(3.0, -2.0, yaw_rad) @ SE2(step_m, 0.3, 0.05)):
@@ -56,7 +54,7 @@ def test_a_station_is_the_same_point_of_the_world_whoever_sees_it(
 
 
 @given(st.floats(-1.2, 1.2), st.floats(-3.0, 3.0))
-def test_it_is_sure_across_the_lane_and_silent_along_it(yaw_rad: float, aside_m: float) -> None:
+def test_covariance_is_small_across_and_infinite_along_the_lane(yaw_rad: float, aside_m: float) -> None:
     for station in found(SE2(), line(yaw_rad, aside_m, 5.0, 25.0)):
         edge = station.edge(4, SE2())
         cov = np.reshape(edge.cov, (2, 2))
@@ -67,7 +65,7 @@ def test_it_is_sure_across_the_lane_and_silent_along_it(yaw_rad: float, aside_m:
         assert abs(along @ cov @ across) < 1e-6
 
 
-def test_two_lanes_have_landmarks_of_their_own() -> None:
+def test_two_lanes_have_different_landmarks() -> None:
     points = np.concatenate([line(0.0, 2.0), line(0.0, -2.0)])
     lanes = np.repeat([5, 6], [len(line(0.0, 2.0))] * 2)
     both, one = fit_stations(points, lanes, CONFIG), fit_stations(points[lanes == 5], lanes[lanes == 5], CONFIG)
@@ -76,7 +74,7 @@ def test_two_lanes_have_landmarks_of_their_own() -> None:
     assert fit_stations(points, np.full(len(points), -1), CONFIG) == []
 
 
-def test_no_station_of_a_stub_or_of_a_blot() -> None:
+def test_short_lanes_and_blobs_have_no_station() -> None:
     assert found(SE2(), line(0.0, 1.0, 5.0, 7.0)) == []  # no stretch of 4 m is spanned
     blot = np.random.default_rng(0).uniform([8.0, -0.7], [12.0, 0.7], (200, 2))
     assert found(SE2(), blot) == []
@@ -118,7 +116,7 @@ def drive(seed: int, edges: bool, weights: WeightsConfig, frames: int = 120) -> 
 
 
 @pytest.mark.slow  # six drives, with and without
-def test_lanes_do_no_harm_to_the_ego_nor_to_what_it_says_of_itself() -> None:
+def test_lanes_keep_the_ego_accurate_and_consistent() -> None:
     """Over six drives; by how much they help is not asked: odometry is surer than a marking within a window."""
     measured = ALL_EDGES
     without = np.array([drive(seed, False, measured) for seed in range(6)])
@@ -128,7 +126,7 @@ def test_lanes_do_no_harm_to_the_ego_nor_to_what_it_says_of_itself() -> None:
     assert 0.5 < with_lanes[:, 1].mean() < 1.5
 
 
-def test_left_out_lanes_leave_the_corners() -> None:
+def test_leaving_out_lanes_keeps_road_points() -> None:
     corner = LandmarkEdge(landmark=7, frame=0, x_m=5.0, y_m=1.0, cov=(0.1, 0.0, 0.0, 0.1))
     (station, *_) = found(SE2(), line(0.0, 1.0))
     record = Measurements(frame_id=0, t_source_ns=0, t_capture_ns=0, t_utc_ns=0, cp=(corner, station.edge(0, SE2())))
@@ -137,7 +135,7 @@ def test_left_out_lanes_leave_the_corners() -> None:
     assert weighted(record, WeightsConfig(leave_out=("cp",))).cp == ()
 
 
-def test_a_station_and_a_corner_of_one_number_are_two_landmarks() -> None:
+def test_station_and_road_point_with_equal_id_are_distinct() -> None:
     """Told apart by their kind alone: the graph ties both, and says the same as with numbers of their own."""
 
     def estimates(station_id: int) -> list[Estimate]:
@@ -157,7 +155,7 @@ def test_a_station_and_a_corner_of_one_number_are_two_landmarks() -> None:
     assert estimates(7) == estimates(8)
 
 
-def test_a_lane_is_no_corner_on_the_map() -> None:
+def test_lane_is_not_a_landmark_on_the_map() -> None:
     graph = PoseGraph(GraphConfig(ego_nodes=1, landmark_least_frames=1), ALL_EDGES)
     for k in range(6):
         cov = tuple(np.diag([1e-4] * 3).ravel().tolist())

@@ -1,4 +1,4 @@
-"""Lines as curves: their motion, single images, drives of images, lanes, who is in them, the map, real images."""
+"""Lane lines as curves: motion, single images, drives, lanes, their users, the map, real images."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ steps = st.tuples(st.floats(-1, 4), st.floats(-0.5, 0.5), st.floats(-0.1, 0.1))
 
 
 @given(curves, steps)
-def test_a_moved_curve_lies_where_it_lay(curve: tuple[float, ...], step: tuple[float, float, float]) -> None:
+def test_moved_curve_is_at_the_same_place(curve: tuple[float, ...], step: tuple[float, float, float]) -> None:
     old, T_old_new = np.array(curve), SE2(*step)
     new, _ = transform_curves(old, T_old_new)
     x = np.array([0.0, 3.0, 8.0])
@@ -155,7 +155,7 @@ def drive(tracker: LineTracker, poses: list[SE2], hidden_from: int = 10**6) -> l
     return out
 
 
-def test_ids_last_and_dashes_are_told_from_a_solid_line() -> None:
+def test_ids_are_stable_and_dashed_is_distinguished_from_solid() -> None:
     poses = [SE2(2.0 * k, 0.2 * math.sin(0.2 * k), 0.02 * math.cos(0.2 * k)) for k in range(25)]
     seen = drive(LineTracker(CAMERA), poses)
     left = [[line for line in lines if 0.5 < line.offset_m < 3.0 and line.kind is not LineKind.EDGE] for lines in seen]
@@ -223,7 +223,7 @@ def test_lines_of_a_bend_through_a_sag_do_not_meet(told: float) -> None:
     assert np.mean(inside) > 0.95
 
 
-def test_a_direction_of_travel_that_is_off_for_long_does_not_drag_lines_along() -> None:
+def test_biased_direction_of_travel_does_not_drag_lines() -> None:
     tracker, off, sigmas = LineTracker(CAMERA), [], []
     for k in range(24):
         true, told = SE2(2.5 * k, 0.0, 0.0), SE2(2.5 * k, 0.02 * 2.5 * k, 0.0)
@@ -239,7 +239,7 @@ def test_a_direction_of_travel_that_is_off_for_long_does_not_drag_lines_along() 
     assert np.mean(np.abs(off) < 2.0 * np.array(sigmas)) > 0.9
 
 
-def test_a_line_is_drawn_on_the_road_as_far_as_a_crest_shows_it() -> None:
+def test_line_is_drawn_up_to_a_crest() -> None:
     crest, straight = -1.6e-3, line(0, 1.75)
     px = line_px(CAMERA, CAMERA.ground, straight, 5.0, crest)
     touches_m = math.sqrt(2.0 * CAMERA.height_m / -crest)
@@ -253,7 +253,7 @@ def test_a_line_is_drawn_on_the_road_as_far_as_a_crest_shows_it() -> None:
 
 
 @pytest.mark.parametrize(("aside_m", "turned_rad"), [(0.0, 0.2), (1.5, -0.2), (1.6, 0.0)])
-def test_lines_that_the_paint_does_not_lie_on_are_looked_for_anew(aside_m: float, turned_rad: float) -> None:
+def test_lines_off_their_paint_are_detected_again(aside_m: float, turned_rad: float) -> None:
     tracker, pose = LineTracker(CAMERA), SE2()
     off = []
     for k in range(18):
@@ -269,7 +269,7 @@ def test_lines_that_the_paint_does_not_lie_on_are_looked_for_anew(aside_m: float
     assert max(map(max, off[13:])) < 0.15
 
 
-def test_a_line_off_its_paint_gives_way_to_the_one_on_it() -> None:
+def test_line_off_its_paint_yields_to_the_one_on_it() -> None:
     tracker = LineTracker(CAMERA)
 
     def left_lines(k: int, left_m: float) -> list[LaneLine]:
@@ -286,7 +286,7 @@ def test_a_line_off_its_paint_gives_way_to_the_one_on_it() -> None:
     assert after[-1][0].offset_m == pytest.approx(2.7, abs=0.15)
 
 
-def test_what_a_bonnet_mirrors_is_no_line_and_the_lane_is_not_drawn_over_it() -> None:
+def test_reflections_on_the_bonnet_are_not_lines() -> None:
     edge_px = np.array([[0.0, 190.0], [320.0, 165.0], [639.0, 190.0]])
     image, masks = picture(SE2(), (1.75, -1.75), (False, False))
     image[170:, 316:324], masks.lane[170:, 316:324] = 220, True
@@ -322,13 +322,13 @@ def with_two_stripes(gap_m: float, road_to_m: float) -> list[LaneLine]:
 
 
 @pytest.mark.parametrize("gap_m", [0.1, 0.15])
-def test_two_stripes_side_by_side_are_one_double_line(gap_m: float) -> None:
+def test_two_parallel_stripes_are_one_double_line(gap_m: float) -> None:
     found = with_two_stripes(gap_m, 8.0)
     assert [line.kind for line in found] == [LineKind.DOUBLE, LineKind.DASHED]
     assert found[0].y_m(8.0) == pytest.approx(1.75, abs=0.1)
 
 
-def test_a_line_with_a_kerb_beside_it_is_no_double_line() -> None:
+def test_line_beside_a_kerb_is_not_double() -> None:
     assert LineKind.DOUBLE not in [line.kind for line in with_two_stripes(0.1, 2.0)]
 
 
@@ -336,7 +336,7 @@ def points_of(image: np.ndarray, masks: Segmentation) -> LinePoints:
     return paint_points(road_view(CAMERA, GroundPlane(CAMERA.height_m), image, masks, NOBODY, None))
 
 
-def test_a_dash_between_cracks_is_no_symbol() -> None:
+def test_dash_between_cracks_is_not_a_symbol() -> None:
     """Between two cracks asphalt is a bright band, which would make the dash an arrow."""
     offset_m, seen = 1.7, []
     for cracks_m in ((), (-0.35, 0.35)):
@@ -352,7 +352,7 @@ def test_a_dash_between_cracks_is_no_symbol() -> None:
     assert cracked > 0.8 * clear > 5
 
 
-def test_a_far_ridge_that_no_network_has_is_no_line_where_kerbs_and_paint_are_one_pixel() -> None:
+def test_far_ridge_without_segmentation_is_not_a_line() -> None:
     """Near ones count; how far is a matter of pixels, not of metres."""
     image, masks = picture(SE2(), (1.7, -1.8), (False, False))
     masked, unseen = points_of(image, masks), points_of(image, Segmentation(masks.road, np.zeros_like(masks.lane)))
@@ -362,7 +362,7 @@ def test_a_far_ridge_that_no_network_has_is_no_line_where_kerbs_and_paint_are_on
     assert np.count_nonzero(masked.x_m * pixel_m <= MAX_UNMASKED_PIXEL_M) == len(unseen)
 
 
-def test_grass_that_a_network_takes_for_road_and_paint_bears_no_line() -> None:
+def test_grass_classified_as_road_has_no_line() -> None:
     image, masks = picture(SE2(), (1.7, -1.8, -9.4), (True, False, False))
     clear = points_of(image, masks)
     cv2.circle(masks.road.view(np.uint8), (600, 135), 4, 1, -1)  # a scrap beside that line, beyond the road's edge
@@ -370,7 +370,7 @@ def test_grass_that_a_network_takes_for_road_and_paint_bears_no_line() -> None:
     assert points_of(image, masks).y_m.min() > -8.5
 
 
-def test_a_line_behind_a_car_stays() -> None:
+def test_line_hidden_by_a_car_is_kept() -> None:
     poses = [SE2(1.5 * k, 0.0, 0.0) for k in range(16)]
     seen = drive(LineTracker(CAMERA), poses, hidden_from=8)
     (before,) = (line for line in seen[7] if 1.0 < line.offset_m < 2.5)
@@ -380,7 +380,7 @@ def test_a_line_behind_a_car_stays() -> None:
     assert after.sigma_m(10.0) > before.sigma_m(10.0)
 
 
-def test_lines_that_a_car_hides_are_not_lost_for_one_beside_it() -> None:
+def test_hidden_lines_do_not_switch_to_their_neighbour() -> None:
     tracker = LineTracker(CAMERA)
     for k in range(14):
         pose, near = SE2(1.5 * k, 0.0, 0.0), k >= 8  # a car close ahead, beside which another line comes into view
@@ -397,7 +397,7 @@ def test_lines_that_a_car_hides_are_not_lost_for_one_beside_it() -> None:
     assert any(abs(at - 5.8) < 0.4 for at in offsets_m)
 
 
-def test_nothing_is_seen_on_a_bare_road_and_nothing_breaks() -> None:
+def test_bare_road_has_no_lines() -> None:
     image = np.full((CAMERA.height_px, CAMERA.width_px), 90, np.uint8)
     for road in (True, False):
         masks = Segmentation(road=np.full(image.shape, road), lane=np.zeros(image.shape, bool))
@@ -405,7 +405,7 @@ def test_nothing_is_seen_on_a_bare_road_and_nothing_breaks() -> None:
         assert not [line for line in lines if line.kind is not LineKind.EDGE]
 
 
-def test_noise_and_jumps_end_nothing() -> None:
+def test_noise_and_jumps_do_not_raise() -> None:
     """Whatever images and motions come, the lines are finite, or there are none."""
     rng = np.random.default_rng(7)
     tracker, pose = LineTracker(CAMERA), SE2()
@@ -433,21 +433,21 @@ def line(number: int, y_m: float, kind: LineKind = LineKind.SOLID, existence: fl
     )  # fmt: skip
 
 
-def test_an_arrow_is_no_bound() -> None:
+def test_arrow_is_not_a_bound() -> None:
     row = lane_row((line(0, 5.2), line(1, 1.6), line(2, 0.0, existence=0.8), line(3, -1.8)))
     assert [(lane.left, lane.right) for lane in row.lanes] == [(0, 1), (1, 3)]
     assert row.ego == 1
 
 
 @pytest.mark.parametrize(("kerb_m", "bound"), [(-1.95, Bound.EDGE), (-1.55, Bound.PAINT)])
-def test_a_bright_kerbstone_past_the_roads_edge_is_no_bound(kerb_m: float, bound: Bound) -> None:
+def test_bright_kerb_beyond_the_road_edge_is_not_a_bound(kerb_m: float, bound: Bound) -> None:
     row = lane_row((line(1, 1.7), line(2, -1.75, LineKind.EDGE), line(3, kerb_m)))
     assert row.ego == 0
     assert row.lanes[0].right_bound is bound
     assert row.lanes[0].right_m(0.0) == pytest.approx(-1.75 if bound is Bound.EDGE else kerb_m)
 
 
-def test_a_lane_with_one_line_is_completed_and_says_so() -> None:
+def test_lane_with_one_line_is_completed_by_width() -> None:
     row = lane_row((line(1, 1.6),), mean_width_m=3.2, mean_width_sigma_m=0.2)
     assert row.ego == 0
     (own,) = row.lanes
@@ -456,7 +456,7 @@ def test_a_lane_with_one_line_is_completed_and_says_so() -> None:
     assert own.width_sigma_m == 0.2
 
 
-def test_edges_without_paint_bound_one_carriageway() -> None:
+def test_road_edges_without_paint_bound_one_carriageway() -> None:
     row = lane_row((line(1, 3.0, LineKind.EDGE), line(2, -3.5, LineKind.EDGE)))
     assert row.ego == 0
     assert row.lanes[0].carriageway
@@ -477,7 +477,7 @@ def test_a_lane_change_is_one_event() -> None:
 
 
 @given(st.floats(3.0, 60.0), st.floats(-12.0, 12.0), st.floats(0.0, 4.0), st.floats(-3.1, 3.1))
-def test_places_of_a_vehicle_sum_to_one(x_m: float, y_m: float, sigma_m: float, yaw_rad: float) -> None:
+def test_lane_probabilities_sum_to_one(x_m: float, y_m: float, sigma_m: float, yaw_rad: float) -> None:
     lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0)
     vehicle = UserInEgo(7, SE2(x_m, y_m, yaw_rad), np.eye(3) * sigma_m**2, 4.0, 8.0)
     (place,) = with_users(lanes, [vehicle], 10.0, Traffic()).vehicles
@@ -485,7 +485,7 @@ def test_places_of_a_vehicle_sum_to_one(x_m: float, y_m: float, sigma_m: float, 
 
 
 @given(st.lists(st.floats(-400.0, 400.0), max_size=3))
-def test_who_is_far_away_is_in_no_lane(xs_m: list[float]) -> None:
+def test_distant_users_are_in_no_lane(xs_m: list[float]) -> None:
     """Also where nobody is nearer."""
     lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0)
     users = [UserInEgo(k, SE2(x_m, 0.1, 0.0), np.eye(3) * 0.1, 4.0, 8.0) for k, x_m in enumerate(xs_m)]
@@ -516,7 +516,7 @@ def crowd(count: int) -> list[UserInEgo]:
     return [UserInEgo(k, SE2(rng.uniform(2, 60), rng.uniform(-9, 9), 0.0), cov, 4.0, 1.5) for k in range(count)]
 
 
-def test_places_are_by_the_lanes_own_bounds_and_sigmas() -> None:
+def test_lane_assignment_uses_bounds_and_sigmas() -> None:
     lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0)
     users = crowd(30)
     for user, place in zip(users, with_users(lanes, users, 10.0, Traffic()).vehicles, strict=True):
@@ -530,7 +530,7 @@ def test_places_are_by_the_lanes_own_bounds_and_sigmas() -> None:
         assert place.ego_lane == pytest.approx(0.5 * inside, abs=1e-9)
 
 
-def test_a_further_road_user_costs_few_calls() -> None:
+def test_cost_per_road_user_is_low() -> None:
     """All are placed at once; one by one, lane by lane and line by line it was half of the optimizer's step."""
     lanes = EgoLane().lanes(tuple(line(k, 8.7 - 3.5 * k) for k in range(6)), 0)
 
@@ -551,7 +551,7 @@ def test_a_further_road_user_costs_few_calls() -> None:
     assert (calls_for(40) - calls_for(20)) / 20 < 60  # 600 before
 
 
-def test_curves_move_together_as_each_alone() -> None:
+def test_curves_move_in_batch_as_singly() -> None:
     rng = np.random.default_rng(0)
     old, step = rng.normal(size=(5, 4)) * [3.0, 0.1, 5e-3, 5e-5], SE2(1.2, -0.1, 0.05)
     new, J = transform_curves(old, step)
@@ -561,7 +561,7 @@ def test_curves_move_together_as_each_alone() -> None:
         assert np.array_equal(J[k], of_it)
 
 
-def test_who_walks_is_in_a_lane_and_leads_nobody_who_cycles_does() -> None:
+def test_cyclists_can_be_leaders_and_pedestrians_cannot() -> None:
     lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0)
     walker = FollowedPerson(person=5, x_m=9.0, y_m=-0.5, cov=(0.2, 0.0, 0.0, 0.05), vx_mps=-1.4, vy_mps=0.0,
                             velocity_cov=(0.1, 0.0, 0.0, 0.1))  # fmt: skip
@@ -573,7 +573,7 @@ def test_who_walks_is_in_a_lane_and_leads_nobody_who_cycles_does() -> None:
     assert found.leader.vehicle == 6
 
 
-def test_a_lane_that_leads_along_the_line_of_sight_needs_no_distance() -> None:
+def test_lane_along_the_line_of_sight_needs_no_distance() -> None:
     leads_aside = msgspec.structs.replace(line(0, 1.75), slope=0.2), msgspec.structs.replace(line(1, -1.75), slope=0.2)
     lanes = EgoLane().lanes(leads_aside, 0)
     far = np.array([6.0, 1.2, 0.0])  # the distance is off by 6 m, and with it the place aside
@@ -586,7 +586,7 @@ def test_a_lane_that_leads_along_the_line_of_sight_needs_no_distance() -> None:
     assert perhaps.ego_lane == pytest.approx(math.erf(1.75 / math.hypot(1.2, 0.1, of_lane_m) / math.sqrt(2)), abs=1e-3)
 
 
-def test_beyond_a_line_where_others_drove_who_is_new_drives_too() -> None:
+def test_vehicles_in_a_used_lane_are_assumed_moving() -> None:
     lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0)
     cov = np.diag([1.0, 0.04, 0.01])
     new = UserInEgo(9, SE2(40.0, 12.0, math.pi), cov, 4.0, 0.0, 8.0, standing=0.7)
@@ -607,7 +607,7 @@ def test_beyond_a_line_where_others_drove_who_is_new_drives_too() -> None:
     assert stood.oncoming < 0.5 * unknown.oncoming
 
 
-def test_where_the_ego_drives_fast_nobody_parks() -> None:
+def test_no_parking_at_high_ego_speed() -> None:
     lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0)
 
     def oncoming(ego_mps: float, standing: float) -> float:
@@ -619,7 +619,7 @@ def test_where_the_ego_drives_fast_nobody_parks() -> None:
     assert oncoming(30.0, 0.99) < 0.3  # on the hard shoulder
 
 
-def test_the_side_of_the_road_is_stated_and_corrected_by_who_comes() -> None:
+def test_traffic_side_is_corrected_by_oncoming_vehicles() -> None:
     lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8), line(3, -5.3)), 0)
     cov = np.diag([1.0, 0.04, 0.01])
 
@@ -640,7 +640,7 @@ def test_the_side_of_the_road_is_stated_and_corrected_by_who_comes() -> None:
     assert mended_right > 0.5 > 3.0 * mended_left
 
 
-def test_a_row_of_parked_cars_beside_a_lane_in_which_others_drive() -> None:
+def test_parked_cars_beside_a_used_lane_are_recognized() -> None:
     lanes = EgoLane().lanes((line(1, 1.7), line(2, -1.8)), 0)
     cov, traffic = np.diag([1.0, 0.04, 0.01]), Traffic()
     for k in range(4):
@@ -653,7 +653,7 @@ def test_a_row_of_parked_cars_beside_a_lane_in_which_others_drive() -> None:
     assert parked.off_road > 0.6
 
 
-def test_a_speed_that_is_hardly_known_does_not_outweigh_the_side() -> None:
+def test_uncertain_speed_does_not_override_the_traffic_side() -> None:
     """A front taken for a back makes who comes drive along, at first."""
     lanes = EgoLane().lanes((line(1, 1.7), line(2, -1.8)), 0)
 
@@ -677,7 +677,7 @@ def body(number: int, x_m: float, y_m: float, yaw_rad: float = 0.0, label: str =
     )  # fmt: skip
 
 
-def test_a_vehicle_stands_for_the_body_in_its_direction() -> None:
+def test_vehicle_extent_follows_its_heading() -> None:
     """A tenth too near, the leader stood for the car of the lane beside, which is nearer to it in metres."""
     truth = tuple(true_line(k, "dashed", y) for k, y in enumerate((5.4, 1.8, -1.8, -5.4)))
     bodies = body(1, 60.0, 0.0), body(2, 56.0, -3.6), body(3, 54.0, 2.0, label="pedestrian", mps=1.0)
@@ -716,7 +716,7 @@ def test_the_lane_between_the_last_dashes_and_the_kerb_is_on_the_road() -> None:
     assert true_place(body(4, 30.0, 3.4, math.pi), truth[:3] + truth[4:]) == "oncoming"
 
 
-def test_cars_along_the_kerb_beyond_a_whole_lane_are_parked_off_the_road() -> None:
+def test_cars_along_the_kerb_beyond_a_lane_are_off_road() -> None:
     lines = ("kerb", -6.4), ("dashed", -1.3), ("double", 1.7), ("dashed", 4.7), ("kerb", 9.8)
     truth = tuple(true_line(k, kind, y) for k, (kind, y) in enumerate(lines))
     assert true_place(body(1, 30.0, -2.8), truth) == "right"
@@ -725,7 +725,7 @@ def test_cars_along_the_kerb_beyond_a_whole_lane_are_parked_off_the_road() -> No
     assert true_place(body(4, 30.0, 8.8), truth) == "off_road"
 
 
-def test_traffic_tells_which_way_a_lane_runs() -> None:
+def test_traffic_determines_the_direction_of_a_lane() -> None:
     lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0)
     cov = np.diag([1.0, 0.04, 0.01])
     unknown = UserInEgo(9, SE2(40.0, 3.4, 0.0), np.diag([1.0, 0.04, 3.0]), 4.0, 2.0)
@@ -753,7 +753,7 @@ def test_traffic_tells_which_way_a_lane_runs() -> None:
     assert unsure.state() == TrafficState()
 
 
-def test_a_lane_that_merges_says_where_it_ends() -> None:
+def test_merging_lane_reports_its_end() -> None:
     sharp = tuple(np.diag([1e-4, 1e-6, 1e-9, 1e-12]).ravel().tolist())
     right = msgspec.structs.replace(line(2, -1.75), cov=sharp)
 
@@ -770,7 +770,7 @@ def test_a_lane_that_merges_says_where_it_ends() -> None:
     assert (narrow.splits_m, wide.ends_m, straight.ends_m, straight.splits_m) == (None,) * 4
 
 
-def test_lines_are_drawn_behind_who_stands_on_the_road() -> None:
+def test_lines_are_drawn_behind_road_users() -> None:
     lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.75), line(2, -1.75)), 0)
     car = VehicleEstimate(
         vehicle=3, T_world_vehicle=SE2(14.0, 1.75, 0.0), cov=(0.0,) * 9, velocity_mps=(0.0, 0.0),
@@ -842,7 +842,7 @@ def test_the_scores_of_known_errors() -> None:
     assert report.width_error_rel == pytest.approx(0.0, abs=1e-9)
 
 
-def test_the_overlap_of_a_lane_with_its_mask() -> None:
+def test_overlap_of_a_lane_with_its_mask() -> None:
     lanes = EgoLane().lanes((line(1, 1.75), line(2, -1.75)), 0)
     assert lanes.ego is not None
     area = lane_mask(CAMERA, CAMERA.ground, lanes.ego)
@@ -878,7 +878,7 @@ def test_the_egos_lane_in_real_images(data_dir: Path, tmp_path: Path) -> None:
     assert json.loads((tmp_path / "report.json").read_bytes())["ego_lane_iou_mean"] == report.ego_lane_iou_mean
 
 
-def test_cars_on_a_lane_are_no_part_of_what_shows() -> None:
+def test_cars_do_not_count_as_visible_lane() -> None:
     image, masks = picture(SE2(), (1.75, -1.75), (False, False))
     masks.road[100:140, 290:350] = masks.lane[100:140, 290:350] = False  # a car
     still = find_lane(CAMERA, cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), masks, np.array([[290.0, 80.0, 350.0, 140.0]]))

@@ -1,4 +1,4 @@
-"""Lanes in the front end: on their schedule, never awaited, said to be late, and their edges in the measurements."""
+"""Lanes in the front end: on their schedule, never awaited, reported when late, and their edges in the measurements."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class Driver:
 
 
 @pytest.mark.parametrize("every", [1, 4, 7])
-def test_lanes_are_found_on_their_schedule_and_say_their_age(every: int) -> None:
+def test_lanes_run_on_their_schedule_and_report_their_age(every: int) -> None:
     complete = Counted()
     drive = Driver(LaneHead(complete, None, every))
     news = [drive.step() for _ in range(21)]
@@ -94,7 +94,7 @@ def test_lanes_are_found_on_their_schedule_and_say_their_age(every: int) -> None
     assert not any(n.status for n in news)
 
 
-def test_it_gives_way_to_frames_between_its_parts() -> None:
+def test_lane_detection_yields_to_frames() -> None:
     """One run of all parts is 15 ms of the interpreter that the frames need, too."""
     ways, image = [0], np.full((CAMERA.height_px, CAMERA.width_px), 90, np.uint8)
 
@@ -114,7 +114,7 @@ def test_it_gives_way_to_frames_between_its_parts() -> None:
         assert ways[0] - before >= (7 if k % 3 == 0 else 2)
 
 
-def test_a_busy_computer_finds_them_less_often() -> None:
+def test_rate_drops_on_a_busy_computer() -> None:
     complete, sparing = Counted(), [1]
     drive = Driver(LaneHead(complete, None, 3, lambda: sparing[0]))
     ages = []
@@ -124,7 +124,7 @@ def test_a_busy_computer_finds_them_less_often() -> None:
     assert ages == [0, 1, 2, 0, 1, 2, 3, 4, 5, 0, 1, 2, 3, 4, 5, 0, 1, 2]
 
 
-def test_a_frame_without_a_segmentation_does_not_starve_them() -> None:
+def test_frame_without_segmentation_does_not_stop_lane_detection() -> None:
     complete = Counted()
     drive = Driver(LaneHead(complete, None, 4))
     ages = [drive.step(None if k in (4, 5, 9) else MASKS).age for k in range(12)]
@@ -132,7 +132,7 @@ def test_a_frame_without_a_segmentation_does_not_starve_them() -> None:
     assert complete.runs == 3
 
 
-def test_a_run_that_is_not_done_is_not_awaited_and_where_lanes_are_due_that_is_said() -> None:
+def test_unfinished_run_is_not_awaited_but_reported() -> None:
     elsewhere = Elsewhere()
     drive = Driver(LaneHead(Counted(), elsewhere, 3))
     for _ in range(12):  # in time, each with the next frame
@@ -154,7 +154,7 @@ def test_a_run_that_is_not_done_is_not_awaited_and_where_lanes_are_due_that_is_s
     assert len(elsewhere.waiting) == 1
 
 
-def test_what_comes_late_lies_where_it_was_seen() -> None:
+def test_late_lanes_are_at_their_own_pose() -> None:
     elsewhere = Elsewhere()
     late, punctual = Driver(LaneHead(None, elsewhere)), Driver(LaneHead())
     before: LaneOutput | None = None
@@ -170,7 +170,7 @@ def test_what_comes_late_lies_where_it_was_seen() -> None:
         elsewhere.work()
 
 
-def test_a_world_that_begins_anew_gets_nothing_of_the_old_one() -> None:
+def test_new_epoch_discards_earlier_lanes() -> None:
     elsewhere = Elsewhere()
     drive = Driver(LaneHead(None, elsewhere))
     drive.step()
@@ -180,7 +180,7 @@ def test_a_world_that_begins_anew_gets_nothing_of_the_old_one() -> None:
     assert (news.points, news.edges, news.age) == ((), (), None)
 
 
-def test_the_edges_are_of_lanes_that_earlier_frames_knew_and_stay_where_they_are() -> None:
+def test_edges_refer_to_known_lanes_at_fixed_positions() -> None:
     drive = Driver(LaneHead(None, None, 4))
     news = [drive.step() for _ in range(30)]
     assert not news[0].edges
@@ -196,7 +196,7 @@ def test_the_edges_are_of_lanes_that_earlier_frames_knew_and_stay_where_they_are
     assert {round(float(np.mean(at, axis=0)[1])) for at in seen.values()} == {3, -2}
 
 
-def test_what_a_frame_saw_is_told_of_the_next_ones_from_where_they_are() -> None:
+def test_lanes_are_transformed_to_later_frames() -> None:
     drive = Driver(LaneHead())
     for _ in range(8):
         seen = drive.step()
@@ -210,7 +210,7 @@ def test_what_a_frame_saw_is_told_of_the_next_ones_from_where_they_are() -> None
         assert {e.frame for e in told.edges} == {drive.frame}
 
 
-def test_a_completion_without_numbers_is_said_and_leaves_what_was_seen() -> None:
+def test_failed_completion_is_reported_and_keeps_observations() -> None:
     whole, broken = Driver(LaneHead(None, None, 3)), Driver(LaneHead(lambda grids: grids * np.nan, None, 3))
     for k in range(9):
         seen, said = whole.step(), broken.step()

@@ -1,4 +1,4 @@
-"""The picture of what lanes are made of: its steps are those of the lanes, and the command draws any drive."""
+"""The picture of lane detection: it shows the steps of lane detection, and the command works on any drive."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def seen_of_a_road() -> AmodalLanes:
     return amodal
 
 
-def test_the_view_is_what_lanes_are_made_of_and_changes_nothing() -> None:
+def test_view_shows_the_grids_without_side_effects() -> None:
     amodal = seen_of_a_road()
     at = SE2(9.75)
     view = lane_view(amodal, at)

@@ -1,4 +1,4 @@
-"""Amodal lanes: what the grids hold, which lanes come out of them, and that they keep their ids."""
+"""Amodal lanes: contents of the grids, extracted lanes, and stable ids."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def drive(road: Floats, boundary: Floats, poses: list[SE2], complete: Completion
 AHEAD = [SE2(0.5 * k) for k in range(40)]
 
 
-def test_each_line_is_a_lane_where_it_lies() -> None:
+def test_each_line_is_a_lane_at_its_position() -> None:
     boundary = np.concatenate([line_m(-3.6), line_m(0.1, dash_m=3.0, gap_m=3.0), line_m(3.4)])
     lanes = drive(road_m(5.0, -5.0), boundary, AHEAD)
     assert [np.median(lane.points_m[:, 1]) for lane in lanes] == pytest.approx([-3.6, 0.1, 3.4], abs=CONFIG.cell_m)
@@ -82,7 +82,7 @@ def test_lines_apart_from_the_road_and_specks_are_dropped() -> None:
     assert drive(road_m(5.0, -5.0), np.concatenate([wall, speck]), AHEAD) == []
 
 
-def test_nothing_seen_is_no_lane() -> None:
+def test_empty_grid_has_no_lane() -> None:
     lanes = AmodalLanes(CONFIG)
     assert lanes.lanes(SE2()) == ()
     lanes.add(SE2(), np.zeros((0, 2)), np.zeros((0, 2)))
@@ -104,7 +104,7 @@ def test_ids_stay_with_their_lanes() -> None:
     assert lanes.lanes(AHEAD[-1]) == ()
 
 
-def test_a_completion_brings_what_was_hidden() -> None:
+def test_completion_adds_hidden_lanes() -> None:
     boundary = np.concatenate([line_m(-3.6), line_m(3.4, end_m=16.0)])
 
     def mirrored(grids: Grids) -> Grids:
@@ -117,7 +117,7 @@ def test_a_completion_brings_what_was_hidden() -> None:
     assert far > 14.0
 
 
-def test_a_completion_makes_no_lane_of_what_nobody_saw() -> None:
+def test_completion_adds_no_lane_without_observation() -> None:
     def with_one_more(grids: Grids) -> Grids:
         out = grids.copy()
         out[BOUNDARY, :, 64] = 1.0
@@ -127,7 +127,7 @@ def test_a_completion_makes_no_lane_of_what_nobody_saw() -> None:
     assert np.median(lane.points_m[:, 1]) == pytest.approx(-3.6, abs=CONFIG.cell_m)
 
 
-def test_only_what_moved_on_is_news() -> None:
+def test_points_are_reported_once() -> None:
     lanes = AmodalLanes(CONFIG)
     assert lanes.has_moved(SE2())
     lanes.add(SE2(), np.zeros((0, 2)), np.zeros((0, 2)))
@@ -168,7 +168,7 @@ def test_every_point_of_the_grid_is_counted_once(points: list[tuple[float, float
         assert np.abs(centres - point).max(axis=1).min() <= 0.5 * CONFIG.cell_m + 1e-9
 
 
-def test_a_lone_cell_is_no_patch() -> None:
+def test_single_cell_is_dropped() -> None:
     cells = np.zeros(CONFIG.shape, dtype=np.bool_)
     cells[5, 5] = cells[40:43, 40] = True
     kept = dense(cells, CONFIG)
@@ -177,7 +177,7 @@ def test_a_lone_cell_is_no_patch() -> None:
     assert not (kept & ~cells).any()
 
 
-def test_masks_are_looked_up_where_the_road_lies() -> None:
+def test_masks_are_sampled_on_the_road_plane() -> None:
     rows, columns = np.mgrid[: CAMERA.height_px, : CAMERA.width_px]
     px = np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64)
     ego = bev.pixel_to_ego(CAMERA, CAMERA.ground, px).reshape(*rows.shape, 2)
@@ -194,7 +194,7 @@ def test_masks_are_looked_up_where_the_road_lies() -> None:
     assert all(not len(p) for p in points_of(masks, CAMERA, CAMERA.ground, hidden, CONFIG))
 
 
-def test_grids_are_what_segregate_takes() -> None:
+def test_grids_are_valid_input_of_segregate() -> None:
     grids = np.zeros((2, *CONFIG.shape), dtype=np.float32)
     grids[ROAD, :, 30:100] = 1.0
     grids[BOUNDARY, 10:100, 64] = 1.0

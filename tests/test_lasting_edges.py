@@ -1,4 +1,4 @@
-"""Laws of the part of a CV edge's error that lasts (graph/factors/lasting_error.py)."""
+"""Properties of the correlated part of a CV edge's error (graph/factors/lasting_error.py)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ positive, numbers = st.floats(1e-3, 1e2), st.floats(-3.0, 3.0)
 
 
 @given(st.floats(0.0, 2.0 * math.pi), st.floats(0.5, 100.0), numbers, numbers, numbers, numbers)
-def test_factors_are_those_of_the_covariance_and_lie_along_the_sight(
+def test_factors_reproduce_covariance_along_line_of_sight(
     bearing_rad: float, far_m: float, a: float, b: float, c: float, d: float
 ) -> None:
     A = np.array([[a, b], [c, d]])
@@ -36,7 +36,7 @@ def test_factors_are_those_of_the_covariance_and_lie_along_the_sight(
 
 
 @given(st.tuples(positive, positive), st.tuples(positive, positive), st.floats(0.0, 100.0), positive)
-def test_an_error_is_kept_in_part_and_whole_where_nothing_changed(
+def test_error_is_fully_correlated_without_change(
     now: tuple[float, float], before: tuple[float, float], driven_s: float, memory_s: float
 ) -> None:
     of, driven = kept(np.array([now]), np.array([before]), np.array([driven_s]), memory_s), np.array([driven_s])
@@ -59,7 +59,7 @@ def variances(frames: int, ego_mps: float, config: GraphConfig) -> Floats:
     return np.diag(found)[:2]
 
 
-def test_what_lasts_is_not_averaged_away_however_often_it_is_seen() -> None:
+def test_correlated_error_does_not_average_out() -> None:
     steady = {"change_forward_mps": 1e-3, "change_sideways_mps": 1e-3, "birth_forward_mps": 1e-2}
     config = GraphConfig(**steady, birth_sideways_mps=1e-2)
     floor = config.lasting_share * np.square(SIGMAS_M)

@@ -1,4 +1,4 @@
-"""What is wrong with a vehicle while it is seen is not averaged away; a box of another vehicle is no motion."""
+"""Correlated errors of a vehicle do not average out; the box of another vehicle is not motion."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def box_of(x_m: float, y_m: float, ground: GroundPlane, height_m: float, edge_m:
 
 
 @pytest.mark.slow  # test_ground_size_filter.py has the law
-def test_errors_that_last_for_a_track_are_in_its_sigma_after_many_frames() -> None:
+def test_sigma_includes_correlated_errors_after_many_frames() -> None:
     """Cars are followed past, each with a height, a lower edge and a road of its own, which all its boxes share."""
     rng, squares = np.random.default_rng(5), {"young": [], "old": []}
     for _ in range(10):
@@ -67,7 +67,7 @@ def test_errors_that_last_for_a_track_are_in_its_sigma_after_many_frames() -> No
     assert 0.2 < old < 1.6  # without the states of what lasts it grows with the frames
 
 
-def test_the_lower_edge_of_a_vehicle_is_never_learned_from_itself() -> None:
+def test_lower_edge_is_not_learned_from_itself() -> None:
     """A car alone on a road that is known: a thousand boxes leave the depth as uncertain as its edge and tilt are."""
     exact = GroundSizeConfig(sigma_pitch_rad=1e-6, sigma_roll_rad=1e-6, sigma_pitch_step_rad=1e-6)
     ground_size = GroundSizeFilter(CAMERA, exact)
@@ -95,7 +95,7 @@ def test_the_lower_edge_of_a_vehicle_is_never_learned_from_itself() -> None:
 
 
 @pytest.mark.parametrize("leap_m", [(4.5,), (3.0,), (2.2, 4.5)])
-def test_a_parked_car_whose_box_becomes_its_neighbours_still_stands(leap_m: tuple[float, ...]) -> None:
+def test_parked_car_with_a_neighbours_box_stays_stationary(leap_m: tuple[float, ...]) -> None:
     """Whether it leaps by a car's length at once, by less, or a box of both lies between."""
     ground_size = GroundSizeFilter(CAMERA, CONFIG)
     tracker = Tracker(CAMERA, TrackingConfig(), LOCALISATION, ground_size, PseudoLidarConfig())
@@ -113,7 +113,7 @@ def test_a_parked_car_whose_box_becomes_its_neighbours_still_stands(leap_m: tupl
     assert standing[-1] > 0.8
 
 
-def test_a_car_that_drives_off_is_not_taken_for_ever_new_neighbours() -> None:
+def test_departing_car_keeps_its_track() -> None:
     ground_size = GroundSizeFilter(CAMERA, CONFIG)
     tracker = Tracker(CAMERA, TrackingConfig(), LOCALISATION, ground_size)
     for k in range(30):

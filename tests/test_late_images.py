@@ -1,4 +1,4 @@
-"""The map process and estimates that come late: a busy computer's, whose age is many frames."""
+"""The map process and late estimates on a busy computer."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def estimates() -> list[Estimate]:
 
 
 @pytest.mark.parametrize("late", [0, WAITING_IMAGES + 3])
-def test_frames_are_looked_at_however_late_their_estimates_come(tmp_path: Path, ring: FrameRing, late: int) -> None:
+def test_frames_are_used_with_late_estimates(tmp_path: Path, ring: FrameRing, late: int) -> None:
     driven, made = Drive(tmp_path, ring), estimates()
     for number, newest in enumerate(made):
         driven.turn(number, newest, made[number - late] if number >= late else None)
@@ -106,9 +106,7 @@ def test_frames_are_looked_at_however_late_their_estimates_come(tmp_path: Path, 
     assert live.looks >= 0.2 * (FRAMES - late)
 
 
-def test_an_image_that_is_not_due_is_not_undistorted(
-    tmp_path: Path, ring: FrameRing, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_due_images_are_undistorted(tmp_path: Path, ring: FrameRing, monkeypatch: pytest.MonkeyPatch) -> None:
     """A car creeps: hardly anything new is seen."""
     undistorted = []
     monkeypatch.setattr(map_process, "Undistorter", lambda camera: lambda image: undistorted.append(1) or image)

@@ -29,7 +29,7 @@ def test_a_percentile_is_exact_to_one_percent(values_ms: list[float], percent: f
     assert distribution.summary()["max"] == pytest.approx(max(values_ms), abs=1e-3)
 
 
-def test_nothing_has_no_percentile_and_anything_fits() -> None:
+def test_empty_histogram_has_no_percentile_and_any_value_fits() -> None:
     distribution = Distribution()
     assert math.isnan(distribution.percentile(50.0))
     assert distribution.summary() == {}

@@ -1,4 +1,4 @@
-"""A lens from the drive alone: what a drive shows of focal length and distortion, and what it does not."""
+"""A lens from the drive: observable focal length and distortion, and priors otherwise."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def calibrated(images: list[CornersOfImage], focal_px: float = FOCAL_PX, sigma_r
 
 
 @pytest.mark.parametrize("k1", [-0.3, pytest.param(0.0, marks=pytest.mark.slow)])
-def test_a_turning_drive_shows_focal_length_and_distortion(k1: float) -> None:
+def test_turning_drive_determines_focal_length_and_distortion(k1: float) -> None:
     lens = calibrated(drive(k1, math.radians(120.0)), 1.1 * FOCAL_PX)
     assert lens.focal_shown
     assert abs(math.log(lens.focal_px / FOCAL_PX)) < 2.0 * lens.focal_sigma_rel
@@ -69,7 +69,7 @@ def test_a_turning_drive_shows_focal_length_and_distortion(k1: float) -> None:
     assert lens.k1_sigma < 0.05
 
 
-def test_a_straight_drive_shows_the_distortion_and_no_focal_length() -> None:
+def test_straight_drive_determines_only_distortion() -> None:
     lens = calibrated(drive(-0.3, 0.0))
     assert not lens.focal_shown
     assert (lens.focal_px, lens.focal_sigma_rel) == (pytest.approx(FOCAL_PX), 0.15)
@@ -78,14 +78,14 @@ def test_a_straight_drive_shows_the_distortion_and_no_focal_length() -> None:
 
 
 @pytest.mark.parametrize("pitch_rad", [-0.06, 0.05])
-def test_the_way_that_it_travels_shows_a_camera_s_pitch(pitch_rad: float) -> None:
+def test_direction_of_travel_determines_pitch(pitch_rad: float) -> None:
     lens = calibrated(drive(-0.2, math.radians(40.0), images=40, pitch_rad=pitch_rad), 1.1 * FOCAL_PX)
     assert lens.pitch is not None
     assert abs(lens.pitch.pitch_rad - pitch_rad) < 3.0 * lens.pitch.sigma_rad
     assert lens.pitch.sigma_rad < 0.015
 
 
-def test_what_is_known_beforehand_is_kept_where_the_drive_shows_no_more() -> None:
+def test_prior_is_kept_without_information() -> None:
     lens = calibrated(drive(-0.2, 0.0), FOCAL_PX, 0.02)
     assert lens.focal_px == pytest.approx(FOCAL_PX, rel=0.03)
     assert lens.focal_sigma_rel == pytest.approx(0.02)
@@ -111,13 +111,13 @@ def test_a_wide_lens_is_about_equidistant() -> None:
     Camera(960, 540, given.px, given.px, 479.5, 269.5, height_m=1.4)  # a pinhole's is refused
 
 
-def test_a_car_that_stands_shows_no_lens() -> None:
+def test_stationary_car_determines_no_lens() -> None:
     standing = drive(-0.2, 0.0, images=40, step_m=0.0)
     assert self_calibrate(standing, SIZE_PX, FOCAL_PX, 0.15) is None
     assert self_calibrate([], SIZE_PX, FOCAL_PX, 0.15) is None
 
 
-def test_corners_that_move_by_themselves_do_not_bend_the_lens() -> None:
+def test_moving_features_do_not_bias_the_lens() -> None:
     images = drive(-0.25, 0.0)
     rng = np.random.default_rng(3)
     wrong = set(
@@ -136,12 +136,12 @@ def test_corners_that_move_by_themselves_do_not_bend_the_lens() -> None:
     assert lens.k1_sigma < 0.1
 
 
-def test_it_is_the_same_each_time() -> None:
+def test_result_is_deterministic() -> None:
     images = drive(-0.15, 0.0, images=48)
     assert calibrated(images) == calibrated(images)
 
 
-def test_a_drive_whose_corners_are_few_on_one_side_has_a_lens_or_none() -> None:
+def test_one_sided_features_give_a_lens_or_none() -> None:
     """Without that part of the image nothing is left of its windows."""
     images = []
     for image in drive(-0.2, math.radians(60.0), images=40):

@@ -1,4 +1,4 @@
-"""The map process beside a drive that goes on: real processes, real zenoh; killed, stalled, refused, on a full disk."""
+"""The map process beside a running drive: real processes, real zenoh; killed, stalled, refused, on a full disk."""
 
 from __future__ import annotations
 
@@ -124,9 +124,7 @@ def hears(planner: Planner, frames: int) -> None:
         heard += planner.wait(1.0) is not None
 
 
-def test_a_planner_is_told_where_it_is_in_the_map(
-    tmp_path_factory: pytest.TempPathFactory, road: Path, kept: bytes
-) -> None:
+def test_planner_gets_poses_in_the_map(tmp_path_factory: pytest.TempPathFactory, road: Path, kept: bytes) -> None:
     place = tmp_path_factory.mktemp("l")
     path = place / "road.map"
     path.write_bytes(kept)
@@ -154,9 +152,7 @@ def test_a_planner_is_told_where_it_is_in_the_map(
     assert {"localised"} <= {pose["state"] for pose in recorded}
 
 
-def test_all_that_a_look_needs_is_loaded_before_the_first_frame(
-    tmp_path_factory: pytest.TempPathFactory, road: Path
-) -> None:
+def test_everything_is_loaded_before_the_first_frame(tmp_path_factory: pytest.TempPathFactory, road: Path) -> None:
     """A new map is looked up in only when it has places."""
     place = tmp_path_factory.mktemp("e")
     with (
@@ -169,7 +165,7 @@ def test_all_that_a_look_needs_is_loaded_before_the_first_frame(
         assert "faiss" in Path(f"/proc/{run.node_pid('map')}/maps").read_text()
 
 
-def test_nobody_notices_that_the_map_process_dies_stalls_and_has_a_full_disk(
+def test_failures_of_the_map_process_do_not_affect_the_drive(
     tmp_path_factory: pytest.TempPathFactory, road: Path, kept: bytes
 ) -> None:
     place = tmp_path_factory.mktemp("k")
@@ -210,7 +206,7 @@ def test_nobody_notices_that_the_map_process_dies_stalls_and_has_a_full_disk(
     assert sorted(entry.name for entry in place.iterdir() if entry.name.startswith(".")) == []
 
 
-def test_what_no_drive_could_use_is_refused_before_it(
+def test_unusable_map_is_refused_before_the_drive(
     tmp_path: Path, road: Path, kept: bytes, capsys: pytest.CaptureFixture[str]
 ) -> None:
     torn, empty, whole = tmp_path / "torn.map", tmp_path / "empty.map", tmp_path / "road.map"

@@ -64,7 +64,7 @@ def test_the_centre_follows_from_the_nearest_face_and_the_yaw(x_m: float, slope:
 
 
 @pytest.mark.parametrize(("x_m", "y_m"), [(3.0, 3.0), (3.5, 3.5), (4.0, -4.0), (4.5, 4.5)])
-def test_of_a_car_beside_the_ego_the_part_that_no_image_shows_counts(x_m: float, y_m: float) -> None:
+def test_invisible_part_of_a_car_beside_the_ego_counts(x_m: float, y_m: float) -> None:
     border = (CAMERA.cx_px if y_m > 0.0 else CAMERA.width_px - CAMERA.cx_px) / CAMERA.fx_px
     cut = np.clip(box_of_car(x_m, y_m), 0.0, [CAMERA.width_px, CAMERA.height_px] * 2)
     seen_from_m = (abs(y_m) - CAR.width_m / 2.0) / border  # the ray of the border meets its side
@@ -74,7 +74,7 @@ def test_of_a_car_beside_the_ego_the_part_that_no_image_shows_counts(x_m: float,
     assert abs(found.centre_m[0] - x_m) < 2.0 * math.sqrt(found.cov[0, 0])
 
 
-def test_a_box_cut_at_the_side_is_placed_by_its_other_edge() -> None:
+def test_box_truncated_at_the_side_uses_its_other_edge() -> None:
     whole = box_of_car(10.0, 7.0)
     assert whole[0] < 0.0 < whole[2]
     cut = np.maximum(whole, 0.0)
@@ -88,7 +88,7 @@ def test_a_box_cut_at_the_side_is_placed_by_its_other_edge() -> None:
     assert found.cov[0, 0] > 3.0 * locate(box_of_car(10.0, 0.0), 10.0 - reach_m).cov[0, 0]
 
 
-def test_of_a_box_cut_below_too_the_way_to_the_centre_is_least_known() -> None:
+def test_box_truncated_below_has_the_largest_sigma_to_the_centre() -> None:
     cut = np.clip(box_of_car(5.0, 3.5), 0.0, [CAMERA.width_px, CAMERA.height_px] * 2)
     (seen,) = observe([cut])
     assert seen.is_cut_at_side
@@ -131,7 +131,7 @@ def test_a_centre_moves_with_its_face_and_is_as_certain(near_m: float) -> None:
     assert here.cov[0, 0] == pytest.approx((moved * sigma) ** 2 + of_length, rel=1e-3)
 
 
-def test_edges_behind_a_nearer_box_are_doubted() -> None:
+def test_edges_occluded_by_a_nearer_box_have_larger_sigma() -> None:
     far, near = np.array([500.0, 170.0, 600.0, 220.0]), np.array([560.0, 160.0, 700.0, 300.0])
     np.testing.assert_array_equal(hidden_edges(np.array([far, near])), [[False, True, True], [False] * 3])
     alone, (_, covered) = observe([far])[0], observe([near, far])
@@ -141,7 +141,7 @@ def test_edges_behind_a_nearer_box_are_doubted() -> None:
 
 
 @given(st.floats(0.0, 1.0), st.floats(0.0, 1.0))
-def test_edges_of_a_doubtful_box_are_doubted(score: float, other: float) -> None:
+def test_edges_of_a_low_score_box_have_larger_sigma(score: float, other: float) -> None:
     box = box_of_car(20.0, 2.0)[None]
     edges = {}
     for each in (score, other):
@@ -152,18 +152,18 @@ def test_edges_of_a_doubtful_box_are_doubted(score: float, other: float) -> None
     assert edges[score][3] / sure.sigma_bottom == pytest.approx(1.0 + 2.0 * max(0.0, 0.9 - score))
 
 
-def test_farther_is_less_certain() -> None:
+def test_sigma_grows_with_distance() -> None:
     assert locate(box_of_car(35.0, 3.0), 33.0).cov[0, 0] > 4.0 * locate(box_of_car(10.0, 0.0), 8.0).cov[0, 0]
 
 
-def test_what_has_no_place_on_the_road_is_left_out() -> None:
+def test_boxes_without_road_position_are_left_out() -> None:
     flying, flat = np.array([600.0, 50.0, 700.0, 120.0]), np.array([600.0, 200.0, 600.0, 250.0])
     assert observe([flying]) == []
     assert observe([flat]) == []
     assert observe([box_of_car(10.0, 0.0)], labels=("person",)) == []
 
 
-def test_one_vehicle_with_two_labels_is_one() -> None:
+def test_vehicle_with_two_labels_is_one_detection() -> None:
     box = box_of_car(12.0, 0.0)
     (seen,) = observe([box, box + 1.0], labels=("car", "truck"), scores=[0.6, 0.8])
     assert seen.label == "truck"

@@ -1,4 +1,4 @@
-"""How often the networks look: fewer looks before frames are dropped, more when there is time, none of it by chance."""
+"""The adaptive rate of the networks: it drops before frames are lost, rises with spare time, and is stable."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def settle(rate: LookRate, work_ms: float, look_ms: float, frames: int) -> list[
 
 
 @pytest.mark.parametrize(("cores", "ms", "sparing"), [(2.0, 22.0, 2), (4.0, 22.0, 1), (2.0, 6.0, 1), (1.0, 22.0, 5)])
-def test_it_begins_with_what_the_cores_carry(cores: float, ms: float, sparing: int) -> None:
+def test_initial_rate_follows_from_the_cores(cores: float, ms: float, sparing: int) -> None:
     costs = {"multitask": Cost(ms, threads=min(2, threads_of_a_network(cores)), every=1)}
     config = LooksConfig()
     rate = LookRate(config, costs, cores, PERIOD_MS)
@@ -44,13 +44,13 @@ def test_it_begins_with_what_the_cores_carry(cores: float, ms: float, sparing: i
 
 
 @pytest.mark.parametrize(("ms", "most"), [(22.0, 5), (4.0, 1), (400.0, 11)])
-def test_looks_that_cost_little_are_left_as_they_are(ms: float, most: int) -> None:
+def test_cheap_networks_run_on_every_frame(ms: float, most: int) -> None:
     rate = look_rate(costs={"multitask": Cost(ms, threads=1, every=1)})
     assert rate.most == most
     assert most == 11 or load({"multitask": Cost(ms, 1, 1)}, PERIOD_MS, most) <= CONFIG.slight_load
 
 
-def test_looks_that_are_spared_are_for_boxes_and_cost_less() -> None:
+def test_skipped_runs_save_the_cost_of_boxes() -> None:
     cost = Cost(ms=22.0, threads=1, every=1, boxes_ms=16.0)
     rate = look_rate(costs={"multitask": cost})
     assert (rate.sparing, rate.masks_every) == (2, 2)
@@ -61,7 +61,7 @@ def test_looks_that_are_spared_are_for_boxes_and_cost_less() -> None:
 
 
 @given(st.floats(0.5, 64.0), st.floats(0.1, 500.0), st.integers(1, 9), st.floats(10.0, 200.0))
-def test_a_faster_computer_never_looks_less_often(cores: float, ms: float, every: int, period_ms: float) -> None:
+def test_faster_computer_never_has_a_lower_rate(cores: float, ms: float, every: int, period_ms: float) -> None:
     costs = {"detector": Cost(ms, 1, every)}
     rate = LookRate(CONFIG, costs, cores, period_ms)
     assert 1 <= rate.sparing <= rate.most
@@ -69,7 +69,7 @@ def test_a_faster_computer_never_looks_less_often(cores: float, ms: float, every
     assert LookRate(CONFIG, {"detector": Cost(ms / 2.0, 1, every)}, cores, period_ms).sparing <= rate.sparing
 
 
-def test_under_load_it_looks_less_often_until_frames_keep_their_pace_and_comes_back() -> None:
+def test_rate_drops_under_load_and_recovers() -> None:
     rate = look_rate()
     settle(rate, work_ms=17.0, look_ms=30.0, frames=40)
     loaded = rate.sparing
@@ -85,7 +85,7 @@ def test_a_dropped_frame_counts_once() -> None:
     assert rate.sparing == before + 1
 
 
-def test_a_try_that_failed_is_tried_again_later_each_time() -> None:
+def test_failed_increase_is_retried_with_growing_delay() -> None:
     rate = look_rate()
     seen = settle(rate, work_ms=10.0, look_ms=22.0, frames=600)  # calm with one look in two, too busy with more
     tried = [k for k, (a, b) in enumerate(itertools.pairwise(seen)) if b < a]
@@ -97,7 +97,7 @@ def test_a_try_that_failed_is_tried_again_later_each_time() -> None:
 
 
 @given(st.lists(st.tuples(st.floats(0.0, 200.0), st.booleans()), max_size=300))
-def test_one_step_at_a_time_within_its_bounds(frames: list[tuple[float, bool]]) -> None:
+def test_rate_changes_by_one_step_within_bounds(frames: list[tuple[float, bool]]) -> None:
     rate = look_rate()
     for step_ms, dropped in frames:
         before = rate.sparing
@@ -115,7 +115,7 @@ def test_every_network_is_measured_on_an_image_of_the_camera() -> None:
     assert min(took_ms.values()) >= 0.0
 
 
-def test_networks_that_are_spared_run_on_fewer_frames() -> None:
+def test_skipped_networks_run_on_fewer_frames() -> None:
     head = Head("detector", every=2)
     networks = Networks([head], run_at_once)
     for frame_id in range(24):
@@ -124,7 +124,7 @@ def test_networks_that_are_spared_run_on_fewer_frames() -> None:
     assert head.frames == [0, 2, 4, 6, 8, 10, 16, 22]
 
 
-def test_a_thread_that_gives_way_is_alone_in_that() -> None:
+def test_only_one_thread_yields() -> None:
     nice: dict[str, int] = {}
 
     def behind() -> None:
@@ -139,7 +139,7 @@ def test_a_thread_that_gives_way_is_alone_in_that() -> None:
     assert os.getpriority(os.PRIO_PROCESS, threading.get_native_id()) == before
 
 
-def test_who_shares_the_interpreter_with_the_frames_has_their_priority() -> None:
+def test_threads_of_one_interpreter_share_priority() -> None:
     """Were it to wait for a core while it holds the interpreter's lock, the frames would wait with it."""
     nice: dict[str, int] = {}
 

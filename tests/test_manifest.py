@@ -1,4 +1,4 @@
-"""Model manifests: what they say, how they are found, and that one that doesn't fit its network is refused by name."""
+"""Model manifests: content, lookup, and errors that name the contradiction with the network."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ CONTRADICTIONS = [
 
 
 @pytest.mark.parametrize(("key", "wrong", "named"), CONTRADICTIONS)
-def test_a_contradiction_names_file_key_and_both_sides(tmp_path: Path, key: str, wrong: str, named: list[str]) -> None:
+def test_contradiction_names_file_key_and_both_values(tmp_path: Path, key: str, wrong: str, named: list[str]) -> None:
     message = refusal(write(tiny.echo(tmp_path / "a.onnx", (1, 3, 16, 32)), SEGMENTER.replace(key, wrong)))
     for part in [str(tmp_path / "a.onnx"), str(tmp_path / "a.toml"), *named]:
         assert part in message
@@ -120,7 +120,7 @@ def test_a_bad_manifest_is_refused_by_name(tmp_path: Path, text: str, named: str
     assert named in str(caught.value)
 
 
-def test_files_that_are_none(tmp_path: Path) -> None:
+def test_invalid_files_are_refused(tmp_path: Path) -> None:
     assert f"{tmp_path / 'no.onnx'}: the network can't be read" in refusal(ModelSpec(str(tmp_path / "no.onnx")))
     whole = tiny.echo(tmp_path / "a.onnx", (1, 3, 16, 32))
     torn = tmp_path / "torn.onnx"
@@ -132,7 +132,7 @@ def test_files_that_are_none(tmp_path: Path) -> None:
     assert "binary.toml" in refusal(ModelSpec(str(whole), manifest=str(tmp_path / "binary.toml")))
 
 
-def test_a_manifest_is_found_in_its_order(tmp_path: Path) -> None:
+def test_manifest_lookup_order(tmp_path: Path) -> None:
     network = tiny.echo(tmp_path / "mine.onnx", (1, 3, 16, 32))
     message = refusal(ModelSpec(str(network)))
     assert "mine.toml" in message
@@ -163,7 +163,7 @@ def test_a_pinned_hash_must_be_the_files(tmp_path: Path) -> None:
     assert read_manifest(shipped_manifests()[name]).sha256 in refusal(ModelSpec(str(stray)))
 
 
-def test_a_head_named_like_a_role_has_that_role(tmp_path: Path) -> None:
+def test_head_named_after_a_role_has_that_role(tmp_path: Path) -> None:
     spec = write(tiny.echo(tmp_path / "a.onnx", (1, 3, 16, 32)), SEGMENTER)
     message = refusal(spec, "detector")
     assert "role: the manifest" in message
@@ -188,9 +188,7 @@ def test_shipped_manifests_are_sound() -> None:
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 1e-45, 1e-39, 9e-21, -1e-30]))
-def test_tiny_weights_are_taken_out_and_nothing_else(
-    tmp_path_factory: pytest.TempPathFactory, seed: int, tiny_: float
-) -> None:
+def test_only_negligible_weights_become_zero(tmp_path_factory: pytest.TempPathFactory, seed: int, tiny_: float) -> None:
     rng = np.random.default_rng(seed)
     weights = rng.normal(size=(5, 4)).astype(np.float32)
     dead = rng.random(weights.shape) < 0.3

@@ -1,4 +1,4 @@
-"""Lines of the road in a kept map: beside their keyframes, moving with them, in its file and its exports."""
+"""Lane lines in a kept map: stored per keyframe, moved with it, in the file and the exports."""
 
 import json
 import zlib
@@ -73,7 +73,7 @@ def aside_m(place_map: PlaceMap, line: int) -> np.ndarray:
     return np.array(out)
 
 
-def test_lines_lie_beside_the_way_along_all_of_it(mapped: bytes) -> None:
+def test_lines_are_beside_the_whole_trajectory(mapped: bytes) -> None:
     place_map = decode_map(mapped)
     for number, (offset_m, kind) in LINES.items():
         found = [line for line in place_map.lines() if line.line == number]

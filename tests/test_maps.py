@@ -1,4 +1,4 @@
-"""The same road twice: places found, maps kept, loops closed; in simulated streets with exact truth."""
+"""Repeated drives: place recognition, kept maps, loop closure, in simulated streets with exact truth."""
 
 import math
 import struct
@@ -88,7 +88,7 @@ def test_a_second_drive_is_localised(mapped: bytes, how: dict[str, float]) -> No
     assert np.degrees(np.abs(error[:, 2])).max() < 1.5
 
 
-def test_a_nodding_car_is_where_its_camera_stands_over_the_road(mapped: bytes) -> None:
+def test_pitching_car_is_localised_at_its_camera(mapped: bytes) -> None:
     """A pitch of a degree would move the foot of a rigid car by 3 cm."""
     along = []
     for nod_rad in (0.0, math.radians(1.0)):
@@ -106,13 +106,11 @@ def test_the_body_is_tilted_about_the_camera_over_its_foot() -> None:
     assert msgspec.to_builtins(found[1]) == pytest.approx(msgspec.to_builtins(attitude))
 
 
-def test_another_street_is_never_this_one(mapped: bytes) -> None:
+def test_other_street_is_not_recognized(mapped: bytes) -> None:
     assert {here.state for here, _ in driven(decode_map(mapped), OTHER, range(60))} == {MapState.LOST}
 
 
-def test_places_are_looked_up_seldom_on_a_way_that_the_map_does_not_know(
-    mapped: bytes, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_queries_are_rare_on_unmapped_road(mapped: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
     """Who is lost looks up with each frame; who makes a new map only so often as that it never misses a street."""
     look_ups = []
     look_up = PlaceIndex.look_up
@@ -124,13 +122,13 @@ def test_places_are_looked_up_seldom_on_a_way_that_the_map_does_not_know(
     assert 0 < len(look_ups) <= 100 / LOOK_UP_EVERY_M + 2
 
 
-def test_who_is_lost_has_no_pose_and_no_small_covariance(mapped: bytes) -> None:
+def test_lost_ego_has_no_pose_and_no_small_covariance(mapped: bytes) -> None:
     for here, _ in driven(decode_map(mapped), OTHER, range(5)):
         assert here.T_map_ego is None
         assert np.isinf(here.cov).all()
 
 
-def test_the_covariance_grows_while_nothing_is_seen_until_it_is_no_localisation(mapped: bytes) -> None:
+def test_covariance_grows_without_matches_until_lost(mapped: bytes) -> None:
     running = session(decode_map(mapped), extend=False)
     states, sigma = [], []
     for number, (estimate, seen, _) in enumerate(drive(STREET, range(10, 70), 3)):
@@ -142,7 +140,7 @@ def test_the_covariance_grows_while_nothing_is_seen_until_it_is_no_localisation(
     assert np.all(np.diff(sigma[20:]) > 0.0)
 
 
-def test_what_odometry_calls_invalid_carries_no_localisation(mapped: bytes) -> None:
+def test_invalid_odometry_ends_localisation(mapped: bytes) -> None:
     states = {}
     for valid in (True, False):
         running = session(decode_map(mapped), extend=False)
@@ -153,7 +151,7 @@ def test_what_odometry_calls_invalid_carries_no_localisation(mapped: bytes) -> N
     assert states == {True: MapState.LOCALISED, False: MapState.ODOMETRY_ONLY}
 
 
-def test_a_new_map_begins_with_the_first_valid_frame() -> None:
+def test_new_map_starts_with_the_first_valid_frame() -> None:
     keyframes = {}
     for valid in (True, False):
         place_map = PlaceMap(MapCamera.of(CAMERA))
@@ -165,7 +163,7 @@ def test_a_new_map_begins_with_the_first_valid_frame() -> None:
     assert np.trace(keyframes[False].cov) < 2.0 * np.trace(keyframes[True].cov)
 
 
-def test_who_looks_and_finds_nothing_soon_is_not_localised(mapped: bytes) -> None:
+def test_failed_queries_end_localisation(mapped: bytes) -> None:
     """In a mapped street, by an odometry that has left it: frames that nobody looked at count for nothing."""
     states: dict[bool, list[MapState]] = {True: [], False: []}
     for looked in states:
@@ -180,7 +178,7 @@ def test_who_looks_and_finds_nothing_soon_is_not_localised(mapped: bytes) -> Non
     assert carried[False] > 2 * carried[True]
 
 
-def test_a_wrong_guess_is_left_for_the_place_that_near_points_show(mapped: bytes) -> None:
+def test_near_points_correct_a_wrong_guess(mapped: bytes) -> None:
     """A guess that is turned about what lies far ahead, where half of the matches are wrong."""
     place_map, chance = decode_map(mapped), np.random.default_rng(2)
     T = SE2(*(float(number) for number in STREET.route[40]))
@@ -204,9 +202,7 @@ def seen_from(points_m: np.ndarray, T_keyframe_ego: SE2) -> np.ndarray:
 
 
 @pytest.mark.parametrize("wrong", [4, 5, 7])
-def test_of_the_places_that_far_points_allow_it_is_the_likeliest_and_not_that_of_the_guess(
-    mapped: bytes, wrong: int
-) -> None:
+def test_far_points_give_the_most_likely_pose_not_the_guess(mapped: bytes, wrong: int) -> None:
     chance = np.random.default_rng(0)
     count, nearest_m, farthest_m = (30, 14), (30.0, 9.0), (60.0, 16.0)  # of far points, and of near ones
     points = np.array(
@@ -227,7 +223,7 @@ def test_of_the_places_that_far_points_allow_it_is_the_likeliest_and_not_that_of
     assert found.T_keyframe_ego.log() == pytest.approx(np.zeros(3), abs=0.1)
 
 
-def test_uncertain_depths_draw_who_drives_aside_no_nearer_to_the_keyframe(mapped: bytes) -> None:
+def test_uncertain_depths_do_not_bias_lateral_offset(mapped: bytes) -> None:
     """Errors in variables attenuate a slope: by depths that err by 6 % who is 3 m aside seemed to be .08 m less so."""
     chance, T, keyframe = np.random.default_rng(3), SE2(0.0, -3.0, 0.0), decode_map(mapped).keyframes[0]
     off, sigma, most_m = [], [], (40.0, 12.0, 5.0)
@@ -246,7 +242,7 @@ def test_uncertain_depths_draw_who_drives_aside_no_nearer_to_the_keyframe(mapped
     assert np.sqrt(np.mean((np.array(off) / sigma) ** 2, axis=0)) == pytest.approx(np.ones(3), abs=0.25)
 
 
-def test_a_step_that_no_car_makes_is_no_localisation(mapped: bytes) -> None:
+def test_implausible_step_ends_localisation(mapped: bytes) -> None:
     """Odometry that calls itself valid goes back by 2 m within a tenth of a second."""
     running = session(decode_map(mapped), extend=False)
     states = {}
@@ -261,7 +257,7 @@ def test_a_step_that_no_car_makes_is_no_localisation(mapped: bytes) -> None:
     assert states[29] is MapState.LOCALISED
 
 
-def test_who_is_unsure_of_its_metres_is_localised_for_a_shorter_way(mapped: bytes) -> None:
+def test_uncertain_scale_shortens_localisation(mapped: bytes) -> None:
     carried = []
     for scale_sigma_rel in (0.0, 0.06):
         running = session(decode_map(mapped), extend=False)
@@ -273,7 +269,7 @@ def test_who_is_unsure_of_its_metres_is_localised_for_a_shorter_way(mapped: byte
     assert 4 <= carried[1] < carried[0] / 2
 
 
-def test_a_pose_that_is_late_or_an_invalid_estimate_is_no_localisation() -> None:
+def test_late_or_invalid_pose_is_not_a_localisation() -> None:
     estimate, _, _ = next(iter(drive(STREET, range(1), 3)))
     pose = MapPose(
         **{name: getattr(estimate, name) for name in ("frame_id", "t_source_ns", "t_capture_ns", "t_utc_ns", "epoch")},
@@ -291,7 +287,7 @@ def test_a_pose_that_is_late_or_an_invalid_estimate_is_no_localisation() -> None
     assert states == [MapState.LOCALISED, MapState.ODOMETRY_ONLY, MapState.ODOMETRY_ONLY]
 
 
-def test_a_kidnapped_car_is_found_again(mapped: bytes) -> None:
+def test_kidnapped_ego_is_relocalised(mapped: bytes) -> None:
     """Odometry goes on as if nothing had been, 50 m further along the street."""
     running = session(decode_map(mapped), extend=False)
     first = list(drive(STREET, range(0, 20), 3))
@@ -311,7 +307,7 @@ def test_a_kidnapped_car_is_found_again(mapped: bytes) -> None:
     assert max(wrong) < 1.0
 
 
-def test_an_extended_map_covers_what_the_second_drive_saw(mapped: bytes) -> None:
+def test_extended_map_covers_the_second_drive(mapped: bytes) -> None:
     place_map = decode_map(mapped)
     before = len(place_map)
     driven(place_map, STREET, range(80, 140), extend=True, seed=5)
@@ -325,7 +321,7 @@ def test_an_extended_map_covers_what_the_second_drive_saw(mapped: bytes) -> None
     assert len(errors(found)) > 15
 
 
-def test_a_drive_that_never_meets_the_map_leaves_it_as_it_is(mapped: bytes) -> None:
+def test_unrelated_drive_does_not_change_the_map(mapped: bytes) -> None:
     place_map = decode_map(mapped)
     running = session(place_map, extend=True)
     for estimate, seen, _ in drive(OTHER, range(40), 3):
@@ -335,7 +331,7 @@ def test_a_drive_that_never_meets_the_map_leaves_it_as_it_is(mapped: bytes) -> N
     assert running.lost_keyframes > 3
 
 
-def test_a_loop_is_closed_and_the_end_lies_on_the_beginning() -> None:
+def test_loop_closure_joins_end_and_start() -> None:
     street = build(block(50.0), seed=4)
     around = len(street.route)
     place_map = PlaceMap(MapCamera.of(CAMERA))
@@ -353,7 +349,7 @@ def test_a_street_of_equal_houses_closes_no_loop() -> None:
     assert not any(link.loop for link in place_map.links)
 
 
-def test_a_false_loop_is_switched_off() -> None:
+def test_false_loop_is_rejected() -> None:
     place_map = PlaceMap(MapCamera.of(CAMERA))
     driven(place_map, STREET, range(60), extend=True)
     last = place_map.keyframes[-1].number
@@ -364,7 +360,7 @@ def test_a_false_loop_is_switched_off() -> None:
     assert false not in held([*place_map.links, false], poses)
 
 
-def test_keyframes_tied_by_loops_that_are_switched_off_stay_where_they_are() -> None:
+def test_rejected_loops_do_not_move_keyframes() -> None:
     place_map = PlaceMap(MapCamera.of(CAMERA))
     driven(place_map, STREET, range(60), extend=True)
     first, cut, last = place_map.keyframes[0], place_map.keyframes[-3], place_map.keyframes[-1]
@@ -378,7 +374,7 @@ def test_keyframes_tied_by_loops_that_are_switched_off_stay_where_they_are() -> 
     assert at_cov[0, 0] > 1e3  # nothing says where it is
 
 
-def test_a_scale_that_drifts_while_it_is_carried_is_taken_out_by_closing_the_loop() -> None:
+def test_loop_closure_corrects_drift_of_carried_scale() -> None:
     """Each keyframe is within its sigma of the truth; where the odometry does not report the drift, not."""
     true, nodes, links = drifting_scale.carried(seed=1, drift=0.06)
     off, sigma = drifting_scale.in_sim2(true, nodes, links)
@@ -390,7 +386,7 @@ def test_a_scale_that_drifts_while_it_is_carried_is_taken_out_by_closing_the_loo
     assert (np.abs(off_silent) < 2.0 * sigma_silent).mean() < 0.95
 
 
-def test_points_of_a_keyframe_are_as_long_as_its_scale_says(mapped: bytes) -> None:
+def test_keyframe_points_follow_its_scale(mapped: bytes) -> None:
     place_map = decode_map(mapped)
     true = decode_map(mapped)
     place_map.keyframes = [
@@ -410,7 +406,7 @@ def test_points_of_a_keyframe_are_as_long_as_its_scale_says(mapped: bytes) -> No
 # --- the file ---
 
 
-def test_a_map_comes_back_as_it_was_written(mapped: bytes, tmp_path: Path) -> None:
+def test_map_is_read_as_written(mapped: bytes, tmp_path: Path) -> None:
     path = tmp_path / "street.map"
     assert write_map(path, decode_map(mapped)) == len(mapped)
     assert encode_map(read_map(path)) == mapped
@@ -424,7 +420,7 @@ def test_the_same_drive_gives_the_same_bytes(mapped: bytes) -> None:
     assert encode_map(place_map) == mapped
 
 
-def test_what_is_no_whole_map_is_refused(mapped: bytes) -> None:
+def test_incomplete_map_is_refused(mapped: bytes) -> None:
     version, length, crc = HEAD.unpack(mapped[len(MAGIC) : len(MAGIC) + HEAD.size])
     body = mapped[len(MAGIC) + HEAD.size :]
     newer = MAGIC + HEAD.pack(version + 1, length, crc) + body
@@ -444,19 +440,19 @@ def test_what_is_no_whole_map_is_refused(mapped: bytes) -> None:
 
 
 @given(st.binary(max_size=200))
-def test_no_bytes_with_a_right_sum_do_harm(body: bytes) -> None:
+def test_corrupt_bytes_with_valid_checksum_do_no_harm(body: bytes) -> None:
     with pytest.raises(MapError):
         decode_map(MAGIC + struct.pack("<HQI", 1, len(body), zlib.crc32(body)) + body)
 
 
-def test_a_map_that_can_not_be_written_leaves_the_old_one(mapped: bytes, tmp_path: Path) -> None:
+def test_failed_write_keeps_the_old_map(mapped: bytes, tmp_path: Path) -> None:
     with pytest.raises(MapError, match="can't be written"):
         write_map(tmp_path / "none" / "street.map", decode_map(mapped))
     with pytest.raises(MapError, match="can't be read"):
         read_map(tmp_path / "street.map")
 
 
-def test_a_run_refuses_what_it_can_not_use(mapped: bytes, tmp_path: Path) -> None:
+def test_run_refuses_unusable_maps(mapped: bytes, tmp_path: Path) -> None:
     path = tmp_path / "street.map"
     path.write_bytes(mapped)
     writes = MapChoice.of(load(None, {"results.map": str(path)}))
@@ -484,7 +480,7 @@ def replace_camera(**changes: float):  # type: ignore[no-untyped-def]
 # --- what is written of a drive ---
 
 
-def test_frames_before_a_place_was_confirmed_are_led_back_to(mapped: bytes, tmp_path: Path) -> None:
+def test_frames_before_confirmation_are_localised_afterwards(mapped: bytes, tmp_path: Path) -> None:
     running, trajectory = session(decode_map(mapped), extend=False), MapTrajectory()
     with TrajectoryFiles(tmp_path) as files:
         for estimate, seen, _ in drive(STREET, range(20, 50), 3):
@@ -498,7 +494,7 @@ def test_frames_before_a_place_was_confirmed_are_led_back_to(mapped: bytes, tmp_
     assert rows[1].split(",")[1] == "localised"
 
 
-def test_over_what_odometry_calls_invalid_nothing_is_led_back(mapped: bytes) -> None:
+def test_no_backward_localisation_over_invalid_odometry(mapped: bytes) -> None:
     """A step of 1 m that no odometry measured: what it says of its length is nothing."""
     running, trajectory = session(decode_map(mapped), extend=False), MapTrajectory()
     rows = []
@@ -510,7 +506,7 @@ def test_over_what_odometry_calls_invalid_nothing_is_led_back(mapped: bytes) -> 
     assert [row.state for row in rows[:3]] == [MapState.LOST, MapState.LOCALISED, MapState.LOCALISED]
 
 
-def test_without_a_place_the_trajectory_is_an_empty_file(tmp_path: Path) -> None:
+def test_trajectory_without_localisation_is_an_empty_file(tmp_path: Path) -> None:
     trajectory = MapTrajectory()
     place_map = PlaceMap(MapCamera.of(CAMERA))
     running = session(place_map, extend=False)
@@ -526,7 +522,7 @@ def test_without_a_place_the_trajectory_is_an_empty_file(tmp_path: Path) -> None
 # --- its parts ---
 
 
-def test_matches_are_each_others_nearest() -> None:
+def test_matches_are_mutual_nearest_neighbours() -> None:
     chance = np.random.default_rng(0)
     a = chance.integers(0, 256, (40, 32), dtype=np.uint8)
     order = chance.permutation(40)
@@ -548,7 +544,7 @@ def bits_apart(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> Ints:
     return (np.unpackbits(a, axis=1)[:, None] != np.unpackbits(b, axis=1)[None]).sum(axis=2)
 
 
-def test_matches_are_those_of_all_pairs_also_where_some_are_as_near() -> None:
+def test_matches_equal_brute_force_with_ties() -> None:
     chance = np.random.default_rng(5)
     a = chance.integers(0, 256, (50, 32), dtype=np.uint8)
     b = np.concatenate([a[:30] ^ np.packbits(chance.random((30, 256)) < 0.1, axis=1), a[20:40], a[35:45]])
@@ -558,7 +554,7 @@ def test_matches_are_those_of_all_pairs_also_where_some_are_as_near() -> None:
     assert not len(match(a, b[:1], 72, 0.85))
 
 
-def test_matches_within_a_radius_are_those_of_all_pairs() -> None:
+def test_matches_within_radius_equal_brute_force() -> None:
     chance = np.random.default_rng(4)
     a = chance.integers(0, 256, (60, 32), dtype=np.uint8)
     b = np.concatenate([a[::-1] ^ np.packbits(chance.random((60, 256)) < 0.2, axis=1), a[:20]])
@@ -662,7 +658,7 @@ def test_the_commands(files: dict[str, Path], tmp_path: Path, capsys: pytest.Cap
         options.call(options)
 
 
-def test_what_is_kept_of_a_long_drive_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_of_a_long_drive_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(held_way, "MAX_POSES", 16)
     driving = map_drive.MapDrive(MapChoice(tmp_path / "new.map", extend=True), CAMERA, tmp_path)
     estimates = [estimate for estimate, _, _ in drive(STREET, range(100), 3)]

@@ -1,4 +1,4 @@
-"""`birdslam models`: what is installed is whole, pinned and fits; what is refused leaves nothing behind."""
+"""`birdslam models`: installed models are complete, pinned and consistent; refused ones leave nothing behind."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def test_adding_again_replaces(tmp_path: Path, store: Path) -> None:
     assert sha256(store / "seg" / "seg.onnx") == sha256(other)
 
 
-def test_what_a_killed_add_has_left_goes_with_the_next(tmp_path: Path, store: Path) -> None:
+def test_leftovers_of_a_killed_add_are_removed_by_the_next(tmp_path: Path, store: Path) -> None:
     (store / ".adding-abc").mkdir(parents=True)
     (store / ".adding-abc" / "half").write_bytes(b"x")
     main(["models", "add", str(segmenter(tmp_path))])
@@ -168,7 +168,7 @@ def test_a_refused_network_leaves_nothing_and_names_the_reason(
         assert sha256(store / "seg" / "seg.onnx") == kept
 
 
-def test_a_network_without_numbers_is_refused(tmp_path: Path, store: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_non_finite_network_is_refused(tmp_path: Path, store: Path, capsys: pytest.CaptureFixture[str]) -> None:
     network = tiny.constant(tmp_path / "nan.onnx", (1, 3, 64, 64), np.full((1, 84, 6), np.nan, np.float32))
     network.with_suffix(".toml").write_text(DETECTOR.replace("classes = 2", "classes = 1"))
     assert "not finite" in refused(capsys, "add", str(network))
@@ -269,7 +269,7 @@ def test_an_address_needs_a_hash_and_brings_its_manifest(
     ].path.replace("again", "seg")
 
 
-def test_a_download_is_whole_or_not_there(tmp_path: Path) -> None:
+def test_download_is_atomic(tmp_path: Path) -> None:
     class Liar(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
             self.send_response(302 if self.path == "/away" else 200)
@@ -324,7 +324,7 @@ def _of_manifest(network: Path, capsys: pytest.CaptureFixture[str], text: str) -
     return refused(capsys, "check", str(network))
 
 
-def test_the_list_says_what_is_broken(tmp_path: Path, store: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_list_reports_broken_models(tmp_path: Path, store: Path, capsys: pytest.CaptureFixture[str]) -> None:
     main(["models", "add", str(segmenter(tmp_path))])
     (store / "seg" / "seg.onnx").write_bytes(b"changed")
     (store / "not a model").mkdir()

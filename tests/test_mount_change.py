@@ -1,4 +1,4 @@
-"""Whether a camera that was knocked, or never stood as its file says, is told from the wander of roads and cars."""
+"""Detection of a knocked or wrongly stated camera mount among variations of roads and cars."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def detect(
 
 
 @pytest.mark.slow
-def test_roads_as_they_are_raise_no_alarm() -> None:
+def test_normal_roads_raise_no_alarm() -> None:
     """40 drives of 1.5 km; the file is off by what its sigma says."""
     alarms = 0
     for seed in range(40):
@@ -53,7 +53,7 @@ def test_roads_as_they_are_raise_no_alarm() -> None:
 
 
 @pytest.mark.parametrize(("axis", "step_deg"), [(0, 1.5), (0, -1.5), (1, 3.5), (1, -3.5)])
-def test_a_knock_is_told_wherever_the_mount_was_before(axis: int, step_deg: float) -> None:
+def test_knock_is_detected_for_any_mount(axis: int, step_deg: float) -> None:
     """Also one that brings the camera nearer to level than it was."""
     before_m, found = 60.0, []
     for seed in range(20):
@@ -72,7 +72,7 @@ def test_a_knock_is_told_wherever_the_mount_was_before(axis: int, step_deg: floa
     assert np.median(found) < 12.0
 
 
-def test_a_knock_that_is_mended_is_no_longer_told() -> None:
+def test_corrected_knock_is_no_longer_reported() -> None:
     tilts = way(400.0, 3)
     off = np.zeros(tilts.shape)
     off[100:250, 0] = math.radians(2.0)
@@ -82,14 +82,14 @@ def test_a_knock_that_is_mended_is_no_longer_told() -> None:
 
 
 @pytest.mark.parametrize(("sigmas", "expected"), [(1.0, False), (5.0, True), (-5.0, True)])
-def test_a_file_that_was_never_right(sigmas: float, expected: bool) -> None:
+def test_wrong_camera_file_is_detected(sigmas: float, expected: bool) -> None:
     tilts = way(300.0, 5)
     off = np.zeros(tilts.shape)
     off[:, 0] = sigmas * CAMERA.tilt_sigma_rad
     assert detect(tilts, off=off)[1][-1] == expected
 
 
-def test_a_file_that_promises_little_is_hard_to_break() -> None:
+def test_uncertain_camera_file_raises_alarm_late() -> None:
     tilts = way(300.0, 6)
     off = np.full(tilts.shape, 0.02)
     vague = replace(CAMERA, tilt_sigma_rad=0.015)
@@ -97,14 +97,14 @@ def test_a_file_that_promises_little_is_hard_to_break() -> None:
     assert not detect(tilts, vague, off)[1].any()
 
 
-def test_a_pothole_is_no_knock() -> None:
+def test_pothole_is_not_a_knock() -> None:
     tilts = way(200.0, 7)
     tilts[100:104, 0] += math.radians(3.0)
     tilts[160:163, 0] -= math.radians(4.0)
     assert not detect(tilts)[1].any()
 
 
-def test_a_tilt_that_was_not_measured_says_nothing() -> None:
+def test_missing_tilt_is_ignored() -> None:
     detector = MountChangeDetector(CAMERA, MountChangeConfig())
     before = detector.mount
     for _ in range(200):

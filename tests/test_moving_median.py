@@ -1,4 +1,4 @@
-"""The paper's metric scale: road points by Eq. 1 over the odometry's own depths, under a moving median."""
+"""The paper's metric scale: road points by Eq. 1 over the odometry's depths, with a moving median."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def scales(given: Sequence[float], frames: int) -> list[float]:
     return out
 
 
-def test_it_is_the_median_of_the_last_frames() -> None:
+def test_scale_is_the_median_of_the_last_frames() -> None:
     given = [3.0, 1.0, 2.0, 8.0, 9.0, 10.0, 1.5]
     assert scales(given, 3) == pytest.approx([3.0, 2.0, 2.0, 2.0, 8.0, 9.0, 9.0])
     assert scales(given, 1) == pytest.approx(given)
@@ -126,7 +126,7 @@ def test_a_hidden_road_carries_the_scale_and_a_new_window_forgets_it() -> None:
     assert scale.is_unknown
 
 
-def test_the_key_chooses_the_strategy_and_is_validated(tmp_path: Path) -> None:
+def test_key_selects_the_strategy_and_is_validated(tmp_path: Path) -> None:
     key = "slam.frontend.odometry.road.mode"
     assert isinstance(Odometry(CAMERA)._scale, RoadScale)  # private: else a drive for each
     paper = load(None, constants={key: "paper"}).slam.frontend.odometry

@@ -1,4 +1,4 @@
-"""The multi-task network: what it is taught can be read back, its decoder's laws, its schedule, the shipped file."""
+"""The multi-task network: targets are decoded back, properties of its decoder, its schedule, the shipped file."""
 
 from __future__ import annotations
 
@@ -171,9 +171,7 @@ sizes_m = st.tuples(st.floats(3.0, 12.0), st.floats(1.5, 2.6), st.floats(1.3, 3.
 
 @settings(max_examples=60)
 @given(poses, sizes_m, st.sampled_from(["car", "truck", "bus"]), st.floats(0.45, 1.3))
-def test_what_is_taught_of_a_body_is_read_back(
-    pose: SE2, size_m: tuple[float, float, float], label: str, focal: float
-) -> None:
+def test_encoded_body_is_decoded(pose: SE2, size_m: tuple[float, float, float], label: str, focal: float) -> None:
     cam = camera(focal)
     body = vehicle(cam, pose, label, size_m)
     example = encode(world(cam, body), WHOLE, WIDTH, HEIGHT, TargetsConfig())
@@ -196,7 +194,7 @@ def test_what_is_taught_of_a_body_is_read_back(
 
 @settings(max_examples=30)
 @given(poses)
-def test_a_mirrored_world_is_read_as_its_mirror(pose: SE2) -> None:
+def test_mirrored_world_is_decoded_mirrored(pose: SE2) -> None:
     cam = camera()
     frame = world(cam, vehicle(cam, pose))
     plain = encode(frame, WHOLE, WIDTH, HEIGHT, TargetsConfig())
@@ -228,7 +226,7 @@ def test_canonical_depth_is_metric_for_every_camera(focal: float) -> None:
     assert 1.0 / found.depth.in_metres(cam).depth_m[near] == pytest.approx(nearness[near], rel=1e-3)
 
 
-def test_a_window_is_a_longer_lens() -> None:
+def test_crop_scales_the_canonical_focal_length() -> None:
     cam = camera()
     body = vehicle(cam, SE2(20.0, 0.5, 0.3))
     example = encode(world(cam, body), Window(80, 24, 240, 72), WIDTH, HEIGHT, TargetsConfig())
@@ -241,7 +239,7 @@ def test_a_window_is_a_longer_lens() -> None:
     )
 
 
-def test_what_can_hardly_be_seen_is_not_taught_and_not_background() -> None:
+def test_barely_visible_objects_are_ignored() -> None:
     cam = camera()
     body = replace(vehicle(cam, SE2(15.0, 0.0, 0.0)), visible=0.1)
     row = encode(world(cam, body), WHOLE, WIDTH, HEIGHT, TargetsConfig()).objects[0]
@@ -252,7 +250,7 @@ def test_what_can_hardly_be_seen_is_not_taught_and_not_background() -> None:
 
 
 @pytest.mark.parametrize("size", [(WIDTH, HEIGHT), (1242, 375), (640, 480)])
-def test_masks_lie_over_the_image(size: tuple[int, int]) -> None:
+def test_masks_cover_the_image(size: tuple[int, int]) -> None:
     frame = world(camera())
     found = read(perfect_answer(encode(frame, WHOLE, WIDTH, HEIGHT, TargetsConfig())), *size).segmentation
     assert found is not None
@@ -269,7 +267,7 @@ def test_masks_lie_over_the_image(size: tuple[int, int]) -> None:
     assert (found.lane & painted).sum() > 0.9 * painted.sum()
 
 
-def test_of_two_boxes_on_one_vehicle_the_better_stays() -> None:
+def test_better_of_two_boxes_is_kept() -> None:
     cam = camera()
     example = encode(world(cam, vehicle(cam, SE2(9.0, 0.0, 0.1))), WHOLE, WIDTH, HEIGHT, TargetsConfig())
     tensors = perfect_answer(example)
@@ -286,7 +284,7 @@ def test_of_two_boxes_on_one_vehicle_the_better_stays() -> None:
 
 
 @pytest.mark.parametrize(("name", "channels"), [("segmentation", 3), ("heat", 1), ("body", 7), ("depth", 2)])
-def test_outputs_that_do_not_fit(name: str, channels: int) -> None:
+def test_mismatched_outputs_are_refused(name: str, channels: int) -> None:
     shape = SHAPES[name]
     with pytest.raises(ManifestMismatch, match=name):
         MultiTaskDecoder(MultiTask(), SIZE, {**SHAPES, name: (1, channels, *shape[2:])})
@@ -323,7 +321,7 @@ def test_perfect_findings_get_the_best_grades() -> None:
 
 
 @pytest.mark.parametrize("certain", [-0.45, -0.75, -1.35])
-def test_validation_finds_the_threshold_of_markings_that_a_network_doubts(certain: float) -> None:
+def test_validation_finds_the_best_threshold_of_markings(certain: float) -> None:
     cam = camera()
     frame = world(cam, vehicle(cam, SE2(14.0, 2.0, 0.2)))
     example = encode(frame, WHOLE, WIDTH, HEIGHT, TargetsConfig())
@@ -341,7 +339,7 @@ def test_validation_finds_the_threshold_of_markings_that_a_network_doubts(certai
     assert (figures["frames"], figures["vehicle_ap50"]) == (2, 1.0)
 
 
-def test_a_false_box_and_a_missed_one_cost_precision() -> None:
+def test_false_and_missed_boxes_lower_the_metrics() -> None:
     cam = camera()
     frame = world(cam, vehicle(cam, SE2(14.0, 2.0, 0.2)), replace(vehicle(cam, SE2(14.0, -2.5, 0.2)), object_id=1))
     found = read(perfect_answer(encode(frame, WHOLE, WIDTH, HEIGHT, TargetsConfig()))).detections
@@ -387,7 +385,7 @@ def findings(label: str) -> Findings:
     return Findings(Detections(np.zeros((1, 4)), np.ones(1), (label,)), Segmentation(mask, mask))
 
 
-def test_one_network_fills_three_roles_and_leaves_those_that_others_have() -> None:
+def test_multitask_network_yields_roles_to_other_networks() -> None:
     image = np.zeros((2, 2), dtype=np.uint8)
     alone = Networks([Head("multitask", findings("car"), every=2)], run_at_once)
     first, second = (alone.start(frame, image).result() for frame in (0, 1))
@@ -450,7 +448,7 @@ def test_unread_outputs_are_not_computed_and_the_rest_is_bit_identical(shipped: 
     assert len(without_outputs(content, ("depth",))) < len(content)
 
 
-def test_the_shipped_network_says_the_same_twice(shipped: Any) -> None:
+def test_shipped_network_is_deterministic(shipped: Any) -> None:
     image = np.random.default_rng(4).integers(0, 256, (375, 1242, 3), dtype=np.uint8)
     again = load_network("multitask", ModelSpec(path=str(shipped.path)))
     a, b = shipped.run(image), again.run(image)
@@ -467,7 +465,7 @@ needs_torch = pytest.mark.skipif(importlib.util.find_spec("torch") is None, reas
 
 
 @needs_torch
-def test_no_certainty_of_an_axis_beyond_the_most_is_rewarded() -> None:
+def test_axis_concentration_is_limited() -> None:
     import torch
 
     from birdslam.world.training.losses import von_mises
@@ -482,7 +480,7 @@ def test_no_certainty_of_an_axis_beyond_the_most_is_rewarded() -> None:
 
 
 @needs_torch
-def test_the_perfect_answer_costs_least() -> None:
+def test_perfect_output_has_the_least_loss() -> None:
     import torch
 
     from birdslam.world.training.losses import LossConfig, loss
@@ -501,7 +499,7 @@ def test_the_perfect_answer_costs_least() -> None:
 
 
 @needs_torch
-def test_steps_of_training_learn() -> None:
+def test_training_steps_reduce_the_loss() -> None:
     from birdslam.world.training.stream import examples as stream
     from birdslam.world.training.trainer import Trainer, TrainerConfig, as_tensors
 
@@ -514,7 +512,7 @@ def test_steps_of_training_learn() -> None:
 
 
 @needs_torch
-def test_a_network_that_sees_further_begins_as_the_one_before_it() -> None:
+def test_context_block_starts_as_identity() -> None:
     import torch
 
     from birdslam.world.training.network import NetworkConfig
@@ -535,7 +533,7 @@ def test_a_network_that_sees_further_begins_as_the_one_before_it() -> None:
 
 
 @needs_torch
-def test_borders_are_added_to_what_a_network_said_without_them() -> None:
+def test_fine_block_starts_as_identity() -> None:
     import torch
 
     from birdslam.world.training.trainer import Trainer, TrainerConfig
@@ -555,7 +553,7 @@ def test_borders_are_added_to_what_a_network_said_without_them() -> None:
 
 
 @needs_torch
-def test_of_several_networks_one_begins_with_the_mean_of_their_weights() -> None:
+def test_training_starts_with_mean_weights() -> None:
     import torch
 
     from birdslam.world.training.network import NetworkConfig
@@ -574,7 +572,7 @@ def test_of_several_networks_one_begins_with_the_mean_of_their_weights() -> None
 
 
 @needs_torch
-def test_of_two_depths_that_an_outline_leaves_open_the_nearer_costs_less() -> None:
+def test_nearer_depth_at_an_outline_has_less_loss() -> None:
     import torch
 
     from birdslam.world.training.losses import Batch, LossConfig, depth_loss
@@ -596,7 +594,7 @@ def test_of_two_depths_that_an_outline_leaves_open_the_nearer_costs_less() -> No
 @needs_torch
 @pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="needs the extra [train]: numba")
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's, of its older ONNX export
-def test_a_training_leaves_a_network_that_loads_and_is_done_when_asked_again(tmp_path: Path) -> None:
+def test_training_writes_a_valid_network_and_resumes(tmp_path: Path) -> None:
     from birdslam.runtime.world.train import main
 
     path, out = tmp_path / "a.toml", tmp_path / "out"
@@ -615,7 +613,7 @@ def test_a_training_leaves_a_network_that_loads_and_is_done_when_asked_again(tmp
     assert load_network("multitask", ModelSpec(path=str(tmp_path / "mean" / "multitask.onnx"))).role == "multitask"
 
 
-def test_extents_tell_a_box_too_narrow_from_one_too_low() -> None:
+def test_extents_distinguish_width_and_height_errors() -> None:
     true = np.array([10.0, 20.0, 110.0, 60.0])
     assert extents(np.array([20.0, 20.0, 100.0, 60.0]), true) == pytest.approx([0.8, 1.0, 2.5])
     assert extents(np.array([10.0, 20.0, 110.0, 56.0]), true) == pytest.approx([1.0, 0.9, 2.5])

@@ -141,7 +141,7 @@ def test_rate_max_keeps_a_window_and_ends_last(monkeypatch: pytest.MonkeyPatch, 
     reader.close()
 
 
-def test_the_end_does_not_wait_for_ever_for_a_lost_frame(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_end_does_not_wait_forever_for_a_lost_frame(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     node, _, reader = make_capture(monkeypatch, tmp_path, Source(1, live=False), rate=1000.0, drain_timeout_s=0.05)
     next(node.step(receive(node).record))
     (end,) = node.step(receive(node).record)
@@ -164,7 +164,7 @@ def test_draining_ends_an_endless_source(monkeypatch: pytest.MonkeyPatch, tmp_pa
     reader.close()
 
 
-def test_a_camera_that_falls_silent_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_silent_camera_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     source = Source(1, live=True)
     node, _, reader = make_capture(monkeypatch, tmp_path, source, rate=None, camera_timeout_s=0.2)
     next(node.step(receive(node).record))
@@ -189,7 +189,7 @@ def test_a_resumed_capture_leaves_a_gap(monkeypatch: pytest.MonkeyPatch, tmp_pat
     reader.close()
 
 
-def test_a_new_optimizer_says_that_the_world_began_anew(tmp_path: Path) -> None:
+def test_new_optimizer_reports_a_new_epoch(tmp_path: Path) -> None:
     configuration = Configuration(vehicle="test", runtime=RuntimeConfig(runtime_dir=str(tmp_path)))
     stamps = {"t_source_ns": 5, "t_capture_ns": 6, "t_utc_ns": 7}
     epochs, told = [], []

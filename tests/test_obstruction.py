@@ -1,4 +1,4 @@
-"""What is fixed to the car in front of the camera: corners that stand on the glass, and a bonnet."""
+"""Obstructions fixed to the car: features on the windscreen, and the bonnet."""
 
 from __future__ import annotations
 
@@ -53,27 +53,27 @@ def drive(
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_a_clean_windscreen_shows_nothing_that_stands(known: bool) -> None:
+def test_clean_windscreen_has_no_obstruction(known: bool) -> None:
     fixed_corners, found, _ = drive(8, 0, known=known)
     assert not fixed_corners.present
     assert not np.concatenate(found).any()
 
 
-def test_dirt_is_told_from_the_street_above_the_horizon_too() -> None:
+def test_dirt_above_the_horizon_is_distinguished_from_the_street() -> None:
     fixed_corners, found, ids = drive(10, 40)
     assert fixed_corners.present
     assert (found[-1] == (ids >= 200)).mean() > 0.9
     assert not found[-1][ids < 200].any()
 
 
-def test_what_stands_is_told_by_the_streets_own_motion_where_no_length_is_known() -> None:
+def test_optical_flow_reveals_dirt_without_known_motion() -> None:
     fixed_corners, found, ids = drive(3, 40, known=False)
     assert fixed_corners.present
     assert found[-1][ids >= 200].all()
     assert not found[-1][ids < 100].any()
 
 
-def test_a_stretch_begins_anew_where_most_corners_were_lost() -> None:
+def test_loss_of_features_restarts_the_test() -> None:
     fixed_corners, px = FixedCorners(CAMERA, FixedCornersConfig()), np.full((20, 2), [300.0, 165.0])
     px[:, 0] += np.arange(20)
     fixed_corners.start(np.arange(20), px)
@@ -85,14 +85,14 @@ def test_a_stretch_begins_anew_where_most_corners_were_lost() -> None:
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_a_standing_car_has_no_dirt(known: bool) -> None:
+def test_stationary_car_has_no_dirt(known: bool) -> None:
     fixed_corners, found, _ = drive(10, 40, step_m=0.0, known=known)
     assert not fixed_corners.present
     assert not np.concatenate(found).any()
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 30))
-def test_corners_that_come_and_go_are_each_told(seed: int, count: int) -> None:
+def test_intermittent_features_are_each_detected(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
     fixed_corners = FixedCorners(CAMERA, FixedCornersConfig())
     for _ in range(4):
@@ -107,7 +107,7 @@ def test_corners_that_come_and_go_are_each_told(seed: int, count: int) -> None:
 
 
 @pytest.mark.parametrize("step_m", [0.3, 1.0, 3.0])
-def test_the_mean_of_the_images_is_over_metres_and_holds_little_of_the_road(step_m: float) -> None:
+def test_mean_image_is_over_distance_and_suppresses_the_road(step_m: float) -> None:
     """What is seen for 3 m is in it with the same weight at any rate, so that it can't pull lengths."""
     fixed_pattern = FixedPattern(FixedPatternConfig())
     for k in range(round(90.0 / step_m)):
@@ -119,7 +119,7 @@ def test_the_mean_of_the_images_is_over_metres_and_holds_little_of_the_road(step
     assert left == pytest.approx(100.0 * 3.0 / FixedPatternConfig().memory_m, rel=0.1)
 
 
-def test_the_mean_begins_anew_with_a_pattern_that_has_come() -> None:
+def test_new_pattern_restarts_the_mean_image() -> None:
     rng = np.random.default_rng(5)
     pattern = cv2.GaussianBlur(rng.normal(0.0, 60.0, (92, 640)), (0, 0), 3.0)
     fixed_pattern, before = FixedPattern(FixedPatternConfig()), None
@@ -159,7 +159,7 @@ def with_bonnet(image: np.ndarray, row: int, rng: np.random.Generator) -> np.nda
 
 
 @pytest.mark.parametrize("row", [140, 165])
-def test_a_bonnet_is_found_where_it_begins(row: int) -> None:
+def test_bonnet_edge_is_found(row: int) -> None:
     rng = np.random.default_rng(1)
     bonnet = Bonnet(BonnetConfig())
     changes = [bonnet.update(with_bonnet(road_image(rng), row, rng), TOP_PX, 1.0) for _ in range(8)]
@@ -172,7 +172,7 @@ def test_a_bonnet_is_found_where_it_begins(row: int) -> None:
     assert len(bonnet.above(above)) == 1
 
 
-def test_lines_of_the_lane_are_no_bonnet() -> None:
+def test_lane_lines_are_not_a_bonnet() -> None:
     rng = np.random.default_rng(2)
     bonnet = Bonnet(BonnetConfig())
     assert not any(bonnet.update(road_image(rng), TOP_PX, 1.0) for _ in range(12))
@@ -181,7 +181,7 @@ def test_lines_of_the_lane_are_no_bonnet() -> None:
     assert bonnet.above(px) is px
 
 
-def test_a_standing_car_learns_no_bonnet() -> None:
+def test_stationary_car_learns_no_bonnet() -> None:
     rng = np.random.default_rng(1)
     bonnet, image = Bonnet(BonnetConfig()), with_bonnet(road_image(rng), 150, rng)
     bonnet.update(image, TOP_PX, 0.0)
@@ -200,7 +200,7 @@ def test_a_bonnet_that_is_gone_is_forgotten() -> None:
     assert not bonnet.present
 
 
-def test_a_bonnet_that_mirrors_now_the_sky_and_now_the_road_stays() -> None:
+def test_bonnet_with_changing_reflections_is_kept() -> None:
     """Its edge is brighter than the road in one part and darker in another, and hardly there between them."""
     rng = np.random.default_rng(4)
     across = np.linspace(-1.0, 1.0, 640)
@@ -215,7 +215,7 @@ def test_a_bonnet_that_mirrors_now_the_sky_and_now_the_road_stays() -> None:
     assert 135 <= bonnet.rows[320] <= 150
 
 
-def test_a_line_across_the_windscreen_is_no_bonnet() -> None:
+def test_line_across_the_windscreen_is_not_a_bonnet() -> None:
     """A reflection is brighter than both its sides."""
     rng = np.random.default_rng(1)
     bonnet = Bonnet(BonnetConfig())
@@ -226,7 +226,7 @@ def test_a_line_across_the_windscreen_is_no_bonnet() -> None:
     assert not bonnet.present
 
 
-def test_a_bonnet_with_writing_on_it_begins_at_its_edge() -> None:
+def test_bonnet_with_text_starts_at_its_edge() -> None:
     rng = np.random.default_rng(1)
     bonnet = Bonnet(BonnetConfig())
     for _ in range(12):

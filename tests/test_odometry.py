@@ -1,4 +1,4 @@
-"""Odometry: laws on a rendered street, and the figures on the real clips (README of the shared data)."""
+"""Odometry: properties on a rendered street, and results on the real clips."""
 
 from __future__ import annotations
 
@@ -179,7 +179,7 @@ def starts() -> list[tuple[Pose, float, Motion]]:
     return out
 
 
-def test_a_rendered_drive_has_its_length_and_its_course() -> None:
+def test_rendered_drive_has_its_length_and_heading() -> None:
     """Median over 15 starts: error of the last pose 0.4 % of the length, 0.10 degrees; spread below 0.01."""
     assert np.median([np.linalg.norm(error.p) / length_m for error, length_m, _ in starts()]) < 0.03
     assert np.median([math.degrees(np.linalg.norm(rotation_log(error.R))) for error, _, _ in starts()]) < 0.3
@@ -205,7 +205,7 @@ def test_the_motion_of_the_foot_is_planar() -> None:
 BRAKING = [(0.5, 0.0)] * 5 + [(0.38, 0.0), (0.26, 0.0), (0.14, 0.0)]  # as hard as tyres can, at 10 Hz
 
 
-def test_standing_holds_exactly_and_goes_on_afterwards() -> None:
+def test_standstill_keeps_the_pose_exactly_and_then_continues() -> None:
     steps = [*BRAKING, *[(0.0, 0.0)] * 10, *[(0.5, 0.0)] * 6]
     truth = street(steps)
     chained, motions = drive(truth)
@@ -215,14 +215,14 @@ def test_standing_holds_exactly_and_goes_on_afterwards() -> None:
     assert path_m(chained.values()) == pytest.approx(path_m(truth), rel=0.04)
 
 
-def test_creeping_is_not_standing() -> None:
+def test_creeping_is_not_a_standstill() -> None:
     truth = street([(0.4, 0.0)] * 8 + [(0.006, 0.0)] * 40)
     chained, _ = drive(truth, rate_hz=33.0)
     crept = np.linalg.norm(chained[48].p - chained[8].p)
     assert crept == pytest.approx(0.24, abs=0.04)
 
 
-def test_a_car_that_comes_to_a_stop_creeps_before_it_stands() -> None:
+def test_stopping_car_creeps_before_standstill() -> None:
     """The shipped drive at its red light: below 0.8 m/s corners move by less than counts from one image to the next."""
     recording = DemoRecording()
     at_m, odometry = recording.truth_poses()[:, :, 3], Odometry(recording.camera)
@@ -285,7 +285,7 @@ def nothing_to_see(k: int, image: np.ndarray) -> np.ndarray:
     return flat if 8 <= k < 22 else image
 
 
-def test_nothing_to_see_coasts_and_begins_anew() -> None:
+def test_without_features_odometry_coasts_and_restarts() -> None:
     truth = street([(0.7, 0.0)] * 30)
     chained, motions = drive(truth, edit=nothing_to_see)
     blind = [m for m in motions if 8 <= m.to_frame < 22]
@@ -295,7 +295,7 @@ def test_nothing_to_see_coasts_and_begins_anew() -> None:
     assert np.linalg.norm(chained[30].p) == pytest.approx(path_m(truth), rel=0.1)
 
 
-def test_a_bump_where_the_window_begins_anew_is_not_a_camera_that_is_mounted_otherwise() -> None:
+def test_bump_at_a_restart_is_not_a_mount_change() -> None:
     """The first direction of a drive may say that the camera file's pitch is wrong; of a later window it may not."""
     truth = [
         Pose(pose.R, pose.p - [0.0, 0.04 if k >= 23 else 0.0, 0.0]) for k, pose in enumerate(street([(0.7, 0.0)] * 28))
@@ -307,7 +307,7 @@ def test_a_bump_where_the_window_begins_anew_is_not_a_camera_that_is_mounted_oth
     assert max(abs(m.ground.pitch_rad - learned_rad) for m in again) < math.radians(1.0)
 
 
-def test_vehicles_everywhere_leave_nothing_to_measure() -> None:
+def test_vehicles_everywhere_give_no_motion() -> None:
     everything = np.array([[-10.0, -10.0, WIDTH_PX + 10.0, HEIGHT_PX + 10.0]])
     _, motions = drive(street([(0.7, 0.0)] * 9), boxes=lambda k: everything if k > 5 else NO_BOXES)
     assert {Status.LOW_TEXTURE, Status.ODOMETRY_COASTING} <= set(motions[-1].status)
@@ -323,7 +323,7 @@ def _lorry(image: np.ndarray, left_px: float, width_px: int) -> tuple[np.ndarray
     return out, np.array([[a, 0.0, b, image.shape[0]]]) if b > a else NO_BOXES
 
 
-def test_a_lorry_that_passes_a_standing_car_does_not_move_it() -> None:
+def test_passing_lorry_does_not_move_a_stationary_ego() -> None:
     truth = street([*BRAKING, *[(0.0, 0.0)] * 14])
     at_px = {k: -260.0 + 45.0 * (k - 8) for k in range(9, 23)}  # it hides up to 40 % of the view
     chained, motions = drive(
@@ -335,7 +335,7 @@ def test_a_lorry_that_passes_a_standing_car_does_not_move_it() -> None:
     assert np.array_equal(chained[22].p, chained[10].p)
 
 
-def test_a_lorry_ahead_that_fills_half_the_view_does_not_hold_the_car_back() -> None:
+def test_large_lorry_ahead_does_not_bias_the_motion() -> None:
     truth = street([(0.6, 0.0)] * 26)
     width_px, left_px = 300, 160.0
     _, box = _lorry(np.zeros((HEIGHT_PX, WIDTH_PX), np.uint8), left_px, width_px)
@@ -357,7 +357,7 @@ def test_a_turn_on_the_spot_at_33_hz_does_not_travel_either() -> None:
     assert np.linalg.norm(turned) == pytest.approx(0.12, abs=0.005)
 
 
-def test_a_hidden_road_carries_the_scale_and_says_so() -> None:
+def test_hidden_road_carries_the_scale_with_status() -> None:
     truth = street([(0.7, 0.0)] * 34)
     hidden = np.zeros((HEIGHT_PX, WIDTH_PX), bool)
     chained, motions = drive(truth, masks=lambda k: hidden if 10 <= k < 26 else None)
@@ -369,7 +369,7 @@ def test_a_hidden_road_carries_the_scale_and_says_so() -> None:
     assert path_m(chained.values()) == pytest.approx(path_m(truth), rel=0.05)
 
 
-def test_a_view_that_contradicts_counts_once_however_often_it_is_looked_at() -> None:
+def test_repeated_contradiction_counts_once() -> None:
     """A dark that travels with the car, and has the grain of a road, lies on the road: for 0.4 m, then 12 m more."""
     steps = [(0.35, 0.0)] * 36 + [(0.03, 0.0)] * 14 + [(0.35, 0.0)] * 36
     truth = street(steps)
@@ -390,7 +390,7 @@ def test_a_view_that_contradicts_counts_once_however_often_it_is_looked_at() -> 
 
 
 @pytest.mark.parametrize("seed", first(1, range(3)))
-def test_which_masks_come_late_moves_the_length_by_no_more_than_is_told(seed: int) -> None:
+def test_late_masks_change_length_within_sigma(seed: int) -> None:
     """Masks of a road that bends: of each frame; then of some frames before or none, as the networks' time has it."""
     truth = street([(0.35, 0.003 * math.sin(k / 6.0)) for k in range(40)])
     images = [render(pose, k) for k, pose in enumerate(truth)]
@@ -423,7 +423,7 @@ def test_which_masks_come_late_moves_the_length_by_no_more_than_is_told(seed: in
     assert abs(math.log(length_m / in_time_m)) < sigma_rel
 
 
-def test_first_images_that_show_nothing_give_no_motion() -> None:
+def test_featureless_first_images_give_no_motion() -> None:
     odometry, black = Odometry(CAMERA), np.zeros((HEIGHT_PX, WIDTH_PX, 3), np.uint8)
     for k in range(3):
         assert odometry.estimate(odometry.track(black), k, k * 10**8, NO_BOXES, None) is None
@@ -450,7 +450,7 @@ class KnownScale(RoadScale):
 
 
 @pytest.mark.parametrize(("step_m", "sigma_m", "valid"), [(1.0, 0.02, True), (1.0, 0.2, False), (0.02, 0.02, True)])
-def test_a_step_whose_own_length_is_vague_is_not_to_be_driven_by(step_m: float, sigma_m: float, valid: bool) -> None:
+def test_motion_of_uncertain_length_is_invalid(step_m: float, sigma_m: float, valid: bool) -> None:
     """However well the scale is known: behind heavy rain few corners are the street's."""
     scale = KnownScale(CAMERA, RoadScaleConfig())
     records = MotionRecords(MotionConfig(), 1.7, scale, MotionModel(), RoadScaleConfig().invalid_sigma_rel)
@@ -459,7 +459,7 @@ def test_a_step_whose_own_length_is_vague_is_not_to_be_driven_by(step_m: float, 
     assert (Status.SCALE_INVALID not in motion.status) == valid
 
 
-def test_twice_the_same_bytes() -> None:
+def test_odometry_is_deterministic() -> None:
     _, again = drive(street(STRAIGHT_10_HZ))
     _, once = straight()
     assert [m.t_prev_curr_m.tobytes() + m.R_prev_curr.tobytes() + m.cov.tobytes() for m in once] == [

@@ -1,4 +1,4 @@
-"""The optimize node alone: frames that perceive does not answer, and the state after a restart."""
+"""The optimize node alone: frames without an answer from perceive, and state after a restart."""
 
 from __future__ import annotations
 
@@ -115,13 +115,13 @@ def test_a_frame_that_was_answered_before_it_was_announced_is_never_overdue() ->
     assert late.record.ref.frame_id == 8
 
 
-def test_the_end_of_the_source_is_no_frame_to_wait_for() -> None:
+def test_end_of_source_is_not_awaited() -> None:
     announced = PendingFrames(MS)
     announced.add(Message(ref(0, 0, (Status.END_OF_SOURCE,)), Trace(), 0))
     assert announced.overdue(10**12) is None
 
 
-def test_a_silent_perceive_is_coasted_over_and_then_given_up(tmp_path: Path) -> None:
+def test_silent_perceive_leads_to_coasting_then_invalid(tmp_path: Path) -> None:
     bus = Bus()
     node = OptimizeNode(configuration(tmp_path, degradation=DegradationConfig(coast_max_ms=100.0)), bus)  # type: ignore[arg-type]
     measured = [made for record in DRIVE[:20] for made in estimates(node, record)]
@@ -146,7 +146,7 @@ def test_a_silent_perceive_is_coasted_over_and_then_given_up(tmp_path: Path) -> 
     assert node.mode == "full"
 
 
-def test_what_was_invalid_stays_so_while_nobody_looks() -> None:
+def test_coasting_keeps_invalid_estimates_invalid() -> None:
     last = msgspec.structs.replace(alone(2)[-1], status=(Status.STANDSTILL, Status.SCALE_INVALID))
     told = unmeasured(ref(2), last, 10**12)
     assert told.status == (Status.COASTING, Status.PERCEPTION_LATE, Status.SCALE_INVALID)
@@ -183,7 +183,7 @@ def test_late_measurements_correct_the_published_estimate(tmp_path: Path) -> Non
 
 @given(st.lists(st.integers(0, 9), min_size=40, max_size=40), st.integers(0, 2**32))
 @settings(max_examples=30)
-def test_frames_never_go_back_and_the_graph_never_notices(lateness: list[int], seed: int) -> None:
+def test_published_frame_numbers_never_fall(lateness: list[int], seed: int) -> None:
     """Measurements come in their order, each so many frames late; a frame is coasted over when it has waited two."""
     node = OptimizeNode(Configuration(source=SourceConfig(rate="max")), Bus())  # type: ignore[arg-type]
     goal = alone(40)
@@ -244,7 +244,7 @@ def test_measurements_since_an_older_checkpoint_are_added_and_not_published_twic
 
 
 @pytest.mark.parametrize("gap", ["perceive is gone", "too long", "nothing kept"])
-def test_a_gap_in_the_measurements_begins_a_new_epoch(tmp_path: Path, gap: str) -> None:
+def test_gap_in_measurements_starts_a_new_epoch(tmp_path: Path, gap: str) -> None:
     killed_at(tmp_path, 20)
     bus = Bus(alive=gap != "perceive is gone", past=DRIVE[25:30] if gap == "too long" else ())
     node = OptimizeNode(configuration(tmp_path), bus, after(19))  # type: ignore[arg-type]
@@ -254,7 +254,7 @@ def test_a_gap_in_the_measurements_begins_a_new_epoch(tmp_path: Path, gap: str) 
     assert first.epoch == 1
 
 
-def test_a_checkpoint_of_an_older_epoch_is_not_taken_up(tmp_path: Path) -> None:
+def test_checkpoint_of_an_older_epoch_is_not_restored(tmp_path: Path) -> None:
     once = configuration(tmp_path, checkpoint_ms=1e9)  # of the first frame, and no more
     node = OptimizeNode(once, Bus())  # type: ignore[arg-type]
     for record in DRIVE[:10]:
@@ -266,7 +266,7 @@ def test_a_checkpoint_of_an_older_epoch_is_not_taken_up(tmp_path: Path) -> None:
     assert (first.epoch, Status.GRAPH_RESET in first.status) == (2, True)
 
 
-def test_a_first_process_and_another_configuration_begin_anew(tmp_path: Path) -> None:
+def test_first_process_and_other_configuration_start_fresh(tmp_path: Path) -> None:
     killed_at(tmp_path, 20)
     other = msgspec.structs.replace(CALM, graph=msgspec.structs.replace(CALM.graph, ego_nodes=7))
     node = OptimizeNode(configuration(tmp_path, slam=other), Bus(past=DRIVE[15:23]), after(19))  # type: ignore[arg-type]
@@ -278,7 +278,7 @@ def test_a_first_process_and_another_configuration_begin_anew(tmp_path: Path) ->
     assert estimates(node, DRIVE[20])[0].epoch > 1
 
 
-def test_a_checkpoint_that_crashes_the_optimizer_is_used_once(tmp_path: Path) -> None:
+def test_checkpoint_that_crashes_is_used_once(tmp_path: Path) -> None:
     killed_at(tmp_path, 20)
     for restored in (True, False):  # the first of them dies before it has kept another
         node = OptimizeNode(configuration(tmp_path), Bus(past=DRIVE[15:23]), after(19))  # type: ignore[arg-type]
@@ -294,7 +294,7 @@ def overwrite(path: Path, start: int, data: bytes) -> None:
         file.write(data)
 
 
-def test_whatever_a_kill_cuts_short_the_other_checkpoint_is_whole(tmp_path: Path) -> None:
+def test_kill_leaves_one_valid_checkpoint(tmp_path: Path) -> None:
     path = tmp_path / "c"
     file = CheckpointFile(path)
     assert file.take() == []
@@ -314,7 +314,7 @@ def test_whatever_a_kill_cuts_short_the_other_checkpoint_is_whole(tmp_path: Path
     assert (tmp_path / "c").stat().st_mode & 0o777 == 0o600
 
 
-def test_another_process_looks_at_the_newest_checkpoint_and_takes_nothing(tmp_path: Path) -> None:
+def test_another_process_may_read_the_newest_checkpoint(tmp_path: Path) -> None:
     path = tmp_path / "c"
     assert newest_checkpoint(path) is None
     file = CheckpointFile(path)
@@ -330,7 +330,7 @@ def test_another_process_looks_at_the_newest_checkpoint_and_takes_nothing(tmp_pa
     assert newest_checkpoint(path) is None
 
 
-def test_a_torn_checkpoint_is_passed_over(tmp_path: Path) -> None:
+def test_damaged_checkpoint_is_skipped(tmp_path: Path) -> None:
     killed_at(tmp_path, 20)
     path = tmp_path / "test" / "checkpoint"
     kept = newest_checkpoint(path)

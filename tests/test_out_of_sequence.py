@@ -1,4 +1,4 @@
-"""Detections that come late: the same vehicles as if they had come in time, shown where they are by now."""
+"""Late detections: the same vehicles as with detections in time, predicted to the present."""
 
 import math
 from dataclasses import replace
@@ -85,7 +85,7 @@ def follow(used: list[int | None], noise_px: float = 0.5) -> tuple[list[tuple[fl
 
 @given(st.lists(st.integers(0, 4), min_size=FRAMES, max_size=FRAMES))
 @settings(max_examples=10)
-def test_vehicles_are_as_if_detections_had_come_in_time(delays: list[int]) -> None:
+def test_late_detections_give_the_same_vehicles(delays: list[int]) -> None:
     """A detector that takes `delays` frames, one image at a time."""
     used: list[int | None] = []
     at_work: tuple[int, int] | None = None
@@ -104,7 +104,7 @@ def test_vehicles_are_as_if_detections_had_come_in_time(delays: list[int]) -> No
 
 
 @pytest.mark.parametrize(("every", "delay"), [(3, 2), (4, 1), (2, 1), (5, 0)])
-def test_frames_that_nobody_looks_at_are_settled_before_the_next_detections_come(every: int, delay: int) -> None:
+def test_frames_without_detector_are_processed_before_next_detections(every: int, delay: int) -> None:
     """Where they settle changes nothing but when the work is done: the tracks and the road are those of before."""
 
     def drive(told: bool) -> tuple[list[list[float]], list[GroundPlane], list[int]]:
@@ -137,7 +137,7 @@ def test_frames_that_nobody_looks_at_are_settled_before_the_next_detections_come
     assert max(told[2][k] for k in arrives) < max(kept_open[2][k] for k in arrives)
 
 
-def test_a_result_is_used_once_and_none_after_the_latest() -> None:
+def test_each_result_is_used_once() -> None:
     seen, _ = follow([0, 1, 2, 2, 2, 2, 6])
     assert sorted({row[0] for row in seen}) == [1, 2, 6]
     vehicles = out_of_sequence(OutOfSequenceConfig(latest_ms=250.0))
@@ -153,7 +153,7 @@ def test_an_older_result_does_not_follow_a_newer_one() -> None:
     assert sorted({row[0] for row in seen}) == [1, 2, 3, 4, 6]
 
 
-def test_a_source_that_begins_anew_awaits_nothing_of_the_old() -> None:
+def test_restarted_source_discards_pending_detections() -> None:
     vehicles = out_of_sequence()
     for k in range(6):
         vehicles.open_frame(open_frame(k))
@@ -200,7 +200,7 @@ def sizes(seed: int) -> tuple[float, ...]:
 
 
 @pytest.mark.parametrize("delay", [1, pytest.param(3, marks=pytest.mark.slow)])
-def test_late_vehicles_are_where_their_covariance_says(delay: int) -> None:
+def test_late_vehicles_are_within_their_covariance(delay: int) -> None:
     late = [deviations(drive(delay, seed, 1.0, sizes(seed))) for seed in range(4)]
     punctual = [deviations(drive(0, seed, 1.0, sizes(seed))) for seed in range(4)]
     squared, metres = (np.concatenate(numbers) for numbers in zip(*late, strict=True))
@@ -211,7 +211,7 @@ def test_late_vehicles_are_where_their_covariance_says(delay: int) -> None:
     assert np.median(metres) < 1.5 * np.median(metres_punctual)
 
 
-def test_late_edges_end_in_the_frame_at_hand_and_carry_on_from_one_another() -> None:
+def test_late_edges_end_in_the_current_frame_and_chain() -> None:
     log = drive(2, 0, 0.0, (CAR.height_m,) * 3)
     last: dict[int, int] = {}
     for m in log:
@@ -228,7 +228,7 @@ def test_late_edges_end_in_the_frame_at_hand_and_carry_on_from_one_another() -> 
 
 
 @pytest.mark.parametrize("delay", [0, 2])
-def test_an_estimate_says_how_old_the_measurements_are_that_tell_of_it(delay: int) -> None:
+def test_estimate_reports_the_age_of_its_measurements(delay: int) -> None:
     graph = PoseGraph(GraphConfig(), WeightsConfig())
     estimates = [graph.optimise(m) for m in drive(delay, 0, 0.0, (CAR.height_m,) * 3)]
     assert len(estimates[-1].vehicles) == 3
@@ -236,13 +236,13 @@ def test_an_estimate_says_how_old_the_measurements_are_that_tell_of_it(delay: in
         assert {v.age_ns + v.delay_ns for v in estimate.vehicles} <= {delay * PERIOD_NS}
 
 
-def test_a_late_vehicle_whose_velocity_is_not_known_is_not_shown() -> None:
+def test_late_vehicle_without_velocity_is_not_reported() -> None:
     shown = [len(m.cv) for m in drive(1, 0, 0.5, (CAR.height_m,) * 3, late_sigma_m=0.45)]
     assert shown[4] < 3
     assert shown[-1] == 3
 
 
-def test_a_detector_that_is_less_sure_of_its_edges_gives_poorer_places() -> None:
+def test_larger_edge_sigma_gives_larger_covariance() -> None:
     """`Detections.edge_sigma` takes the place of the configuration's own."""
     config = LocalisationConfig()
     own, poor = EdgeSigma((config.sigma_box_rel,) * 4, config.sigma_box_px), EdgeSigma((0.2,) * 4, 10.0)

@@ -1,4 +1,4 @@
-"""Paper mode is the paper: what each edge adds to the information about a log without noise, and nothing else does."""
+"""Paper mode: the information that each edge adds, and nothing else."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def added(log: list[Measurements]) -> list[tuple[Window, CvEdges, Floats]]:
     return out
 
 
-def test_each_edge_adds_its_lambda_and_nothing_adds_more() -> None:
+def test_each_edge_adds_exactly_its_lambda() -> None:
     log = told_of_more(drive(EXACT, 2))
     landmarks = [{e.landmark for e in m.cp if e.x_m <= THRESHOLD_M} for m in log]
     summed = 0
@@ -120,7 +120,7 @@ def test_cc_cv_and_vv_are_the_batch_of_the_papers_edges() -> None:
         np.testing.assert_allclose(*covs, rtol=0.02, atol=1e-2 * covs[1].max())
 
 
-def test_a_landmark_stays_where_it_was_first_seen() -> None:
+def test_landmark_is_fixed_at_first_observation() -> None:
     """Without noise but for one step of the ego that is told 0.5 m too long: a landmark seen before and after it takes
     the ego back by the share of its weight, and so do the frames after, since X_p of Eq. 3 moves with none of them."""
     log = drive(replace(EXACT, vehicles=0, landmarks=0), 2).measurements
@@ -146,7 +146,7 @@ def test_a_landmark_stays_where_it_was_first_seen() -> None:
     assert max(map(abs, errors_m[23:])) < 0.5 * errors_m[22]  # and nothing brings it back
 
 
-def test_a_yaw_turned_about_is_a_yaw_that_errs() -> None:
+def test_reversed_yaw_is_used_as_measured() -> None:
     """One detection the wrong way round turns the vehicle by its weight, not by half a turn at no cost."""
     log = drive(replace(EXACT, landmarks=0), 2).measurements
     edge = log[20].cv[0]
@@ -189,7 +189,7 @@ def test_no_edge_is_an_outlier(kind: str) -> None:
     assert moved_m(10.0) == pytest.approx(20.0 * moved_m(0.5), rel=0.05)
 
 
-def test_cp_of_vehicles_adds_its_lambda_to_their_place_in_the_world() -> None:
+def test_cp_of_vehicles_adds_lambda_to_world_position() -> None:
     """Eq. 7 with A a vehicle: one edge for each known landmark, to the place, of no agent the orientation."""
     log = drive(EXACT, 2).measurements
     landmarks = [{e.landmark for e in m.cp if e.x_m <= THRESHOLD_M} for m in log]
@@ -220,7 +220,7 @@ def test_cp_of_vehicles_adds_its_lambda_to_their_place_in_the_world() -> None:
         assert with_them.T_world_ego.between(without.T_world_ego).log() == pytest.approx(np.zeros(3), abs=1e-6)
 
 
-def test_cp_of_a_vehicle_takes_it_to_where_its_landmark_says() -> None:
+def test_cp_of_a_vehicle_moves_it_to_its_landmark() -> None:
     """One CV edge that is 1 m off, against a landmark seen with it: the car goes there by CP's share of the weights."""
     log = drive(replace(EXACT, vehicles=1, landmarks=12), 2).measurements
     last = log[-1]

@@ -1,4 +1,4 @@
-"""Sizes from the growth of what stands, and none from what drives."""
+"""Vehicle sizes from the parallax of stationary vehicles only."""
 
 import math
 
@@ -80,14 +80,14 @@ class Road:
 
 
 @pytest.mark.parametrize("height_m", [1.40, 1.53, 1.70])
-def test_a_parked_car_tells_its_size_as_the_ego_comes_near(height_m: float) -> None:
+def test_parallax_determines_size_of_a_parked_car(height_m: float) -> None:
     road = Road(height_m)
     learned = road.drive(5.5)
     assert road.parallax.stationary_probability(0) > 0.95
     assert road.height(learned) == pytest.approx(height_m, rel=0.03)
 
 
-def test_what_stands_and_is_of_no_usual_size_is_seen_through() -> None:
+def test_unusual_size_of_a_stationary_vehicle_is_found() -> None:
     road = Road(2.45)
     learned = road.drive(5.5)
     assert road.parallax.stationary_probability(0) > 0.9
@@ -97,7 +97,7 @@ def test_what_stands_and_is_of_no_usual_size_is_seen_through() -> None:
 
 
 @pytest.mark.parametrize("mps", [(9.0, 0.0), (12.0, 0.0), (-9.0, 0.0), (0.0, 4.0)])
-def test_one_that_drives_does_not_stand_and_keeps_the_size_of_its_class(mps: tuple[float, float]) -> None:
+def test_moving_vehicle_keeps_the_class_size(mps: tuple[float, float]) -> None:
     road = Road(1.53, x_m=60.0)
     learned = road.drive(2.5, mps)
     assert road.parallax.stationary_probability(0) < 0.1
@@ -107,7 +107,7 @@ def test_one_that_drives_does_not_stand_and_keeps_the_size_of_its_class(mps: tup
 
 
 @pytest.mark.parametrize("mps", [(0.0, 0.0), (1.8, 0.0)])
-def test_straight_ahead_nothing_tells_a_parked_car_from_a_slow_one_so_that_no_size_is_learned(
+def test_no_size_is_learned_straight_ahead(
     mps: tuple[float, float],
 ) -> None:
     learned = Road(1.70, x_m=16.0, y_m=0.3, ego_mps=2.3).drive(4.0, mps)
@@ -118,9 +118,7 @@ def test_straight_ahead_nothing_tells_a_parked_car_from_a_slow_one_so_that_no_si
 
 @pytest.mark.parametrize("height_m", [1.53, 1.65, 1.75])
 @pytest.mark.parametrize(("mps", "stands"), [(0.0, True), (2.0, False), (3.0, False), (-3.0, False)])
-def test_a_queue_in_the_next_lane_is_not_taken_for_tall_cars_that_stand(
-    height_m: float, mps: float, stands: bool
-) -> None:
+def test_slow_queue_is_not_taken_for_tall_stationary_cars(height_m: float, mps: float, stands: bool) -> None:
     """It grows slower than what stands, as a taller car would; its class and the ground say that it is none."""
     road = Road(height_m, x_m=45.0, ego_mps=8.0)
     road.parallax = Parallax(ParallaxConfig())  # errors last, so that few frames count
@@ -129,7 +127,7 @@ def test_a_queue_in_the_next_lane_is_not_taken_for_tall_cars_that_stand(
     assert (road.parallax.stationary_probability(0) < 0.3) == (not stands)
 
 
-def test_far_aside_of_the_road_whatever_keeps_its_bearing_in_the_world_stands() -> None:
+def test_far_beside_the_road_constant_bearing_means_stationary() -> None:
     """There nothing says in which direction it would drive, so that its standing still shows sooner."""
     aside = Road(1.53, x_m=60.0, y_m=20.0)
     aside.drive(1.5)
@@ -138,7 +136,7 @@ def test_far_aside_of_the_road_whatever_keeps_its_bearing_in_the_world_stands() 
     assert aside.parallax.stationary_probability(0) > beside.parallax.stationary_probability(0)
 
 
-def test_one_that_starts_and_one_that_stops() -> None:
+def test_starting_and_stopping_vehicles() -> None:
     road = Road(1.53, x_m=60.0, ego_mps=4.0)
     road.drive(4.0)
     assert road.parallax.stationary_probability(0) > 0.9
@@ -148,7 +146,7 @@ def test_one_that_starts_and_one_that_stops() -> None:
     assert road.parallax.stationary_probability(0) > 0.5
 
 
-def test_its_covariance_is_honest() -> None:
+def test_covariance_is_consistent() -> None:
     squared = []
     for seed in range(24):
         height_m = CLASS_M * math.exp(SIGMAS[0] * np.random.default_rng([7, seed]).standard_normal())
@@ -158,7 +156,7 @@ def test_its_covariance_is_honest() -> None:
     assert 0.4 < np.mean(squared) < 1.6
 
 
-def test_a_faster_camera_learns_no_more_in_the_same_time_from_errors_that_last() -> None:
+def test_frame_rate_adds_no_information_to_correlated_errors() -> None:
     told = []
     for hz in (10.0, 30.0):
         road = Road(1.53, hz=hz)
@@ -167,13 +165,13 @@ def test_a_faster_camera_learns_no_more_in_the_same_time_from_errors_that_last()
     assert told[0] == pytest.approx(told[1], rel=0.1)
 
 
-def test_without_motion_nothing_is_learned() -> None:
+def test_without_motion_nothing_is_estimated() -> None:
     road = Road(1.7, ego_mps=0.0)
     learned = road.drive(5.0)
     assert road.height(learned) == pytest.approx(CLASS_M, rel=0.03)
 
 
-def test_the_forgotten_are_gone_and_the_rest_stay() -> None:
+def test_dropped_tracks_are_removed_and_others_kept() -> None:
     road = Road(1.53)
     road.drive(1.0)
     before = road.parallax.stationary_probability(0)
@@ -189,7 +187,7 @@ def test_the_forgotten_are_gone_and_the_rest_stay() -> None:
 
 @given(st.lists(st.tuples(st.floats(-8, 8), st.floats(-8, 8), st.floats(-8, 8)), min_size=3, max_size=25))
 @settings(max_examples=25)
-def test_outliers_leave_weights_and_covariances_what_they_are(noise: list[tuple[float, float, float]]) -> None:
+def test_outliers_do_not_change_weights_and_covariances(noise: list[tuple[float, float, float]]) -> None:
     parallax = Parallax(ParallaxConfig())
     parallax.add_vehicle(np.array([30.0, 2.0]), 0.0, SE2(), math.log(CLASS_M), SIGMAS)
     for k, draws in enumerate(noise):

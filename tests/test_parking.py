@@ -1,4 +1,4 @@
-"""Parked cars of the built-in world: in rows beside the street, nobody in anybody, nothing built on a lot."""
+"""Parked cars of the built-in world: in rows beside the street, without overlaps, lots free of buildings."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def _apart(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
     return False
 
 
-def test_no_vehicle_stands_in_another(places: list[Place]) -> None:
+def test_vehicles_do_not_overlap(places: list[Place]) -> None:
     pairs = 0
     for *_, movers in places:
         cars = [mover for mover in movers if mover.body.label in ("car", "van", "truck", "bus")]
@@ -66,7 +66,7 @@ def test_no_vehicle_stands_in_another(places: list[Place]) -> None:
     assert pairs > 1000
 
 
-def test_lots_have_cars_aslant_and_across_that_hide_each_other(places: list[Place]) -> None:
+def test_lots_have_angled_and_perpendicular_cars(places: list[Place]) -> None:
     tilts, counts = [], []
     for _, lots, _, movers in places:
         for lot in lots:
@@ -91,7 +91,7 @@ def test_nothing_is_built_on_a_lot_and_no_side_road_runs_through_it(places: list
                     assert not (lot.s0_m < s_m < lot.s1_m and low < d_m < high)
 
 
-def test_what_is_off_the_lots_stays_and_so_do_posts_at_their_edge() -> None:
+def test_scenery_off_the_lots_is_kept() -> None:
     lot = Lot(40.0, 60.0, 8.0, 16.0, (), 0.0)
     standing = Scenery([], [], [], [], [])
     for kind, s_m, d_m in (
@@ -116,7 +116,7 @@ def test_the_same_seed_parks_the_same_cars() -> None:
     assert draw() == draw()
 
 
-def test_who_stands_behind_a_kerb_stands_on_it(places: list[Place]) -> None:
+def test_bodies_behind_a_kerb_are_on_the_pavement(places: list[Place]) -> None:
     raised = 0
     for street, *_, movers in places:
         scene = moving(street, movers)

@@ -1,4 +1,4 @@
-"""People in bird's-eye view: placed by feet and height, followed, told of in the world of the graph."""
+"""People in bird's-eye view: placed by feet and height, tracked, reported in the world of the graph."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def observed(boxes: list[Box], labels: list[str]) -> list[str]:
 # --- which boxes are whom ---
 
 
-def test_a_rider_and_the_bicycle_are_one_and_a_motorcycles_rider_is_no_pedestrian() -> None:
+def test_rider_and_bicycle_are_one_and_motorcyclist_is_not_a_pedestrian() -> None:
     person, mount = (600.0, 150.0, 640.0, 250.0), (595.0, 200.0, 645.0, 265.0)
     (whole,) = observe_people(found([person, mount], ["person", "bicycle"]), CAMERA, CAMERA.ground, PeopleBoxesConfig())
     assert whole.label == "cyclist"
@@ -107,21 +107,21 @@ def test_a_rider_and_the_bicycle_are_one_and_a_motorcycles_rider_is_no_pedestria
     assert sorted(observed([person, beside, mount], ["person", "person", "bicycle"])) == ["cyclist", "pedestrian"]
 
 
-def test_a_cyclists_rider_is_one_with_it_and_who_stands_before_a_cyclist_is_not() -> None:
+def test_only_the_rider_is_merged_with_a_bicycle() -> None:
     cyclist = (449.0, 124.0, 474.0, 185.0)
     assert observed([cyclist, (451.0, 124.0, 472.0, 178.0)], ["cyclist", "person"]) == ["cyclist"]
     before = (455.0, 126.0, 478.0, 197.0)
     assert sorted(observed([cyclist, before], ["cyclist", "person"])) == ["cyclist", "pedestrian"]
 
 
-def test_who_sits_in_a_car_is_no_pedestrian_and_who_stands_before_or_behind_it_is() -> None:
+def test_occupants_are_not_pedestrians_and_people_near_cars_are() -> None:
     car = (500.0, 160.0, 700.0, 280.0)
     assert observed([car, (560.0, 170.0, 600.0, 220.0)], ["car", "person"]) == []
     assert observed([car, (560.0, 165.0, 600.0, 290.0)], ["car", "person"]) == ["pedestrian"]
     assert observed([car, (560.0, 130.0, 600.0, 220.0)], ["car", "person"]) == ["pedestrian"]
 
 
-def test_a_bicycle_without_a_rider_begins_no_track() -> None:
+def test_bicycle_without_rider_starts_no_track() -> None:
     scene = Scene()
     for _ in range(5):
         assert scene.see(found([(595.0, 200.0, 645.0, 265.0)], ["bicycle"])) == ()
@@ -132,7 +132,7 @@ def test_a_bicycle_without_a_rider_begins_no_track() -> None:
 
 @given(x_m=st.floats(7.0, 40.0), bearing=st.floats(-0.6, 0.6), height_m=st.floats(1.55, 1.9))
 @settings(max_examples=25)
-def test_a_standing_person_is_placed_within_the_sigmas(x_m: float, bearing: float, height_m: float) -> None:
+def test_stationary_person_is_within_sigma(x_m: float, bearing: float, height_m: float) -> None:
     scene = Scene()
     for _ in range(3):
         people = scene.see(found([box_of(x_m, bearing * x_m, height_m)]))
@@ -143,7 +143,7 @@ def test_a_standing_person_is_placed_within_the_sigmas(x_m: float, bearing: floa
     assert person.person == FIRST_PERSON
 
 
-def test_a_child_is_near_and_no_distant_adult() -> None:
+def test_child_is_not_a_distant_adult() -> None:
     scene = Scene()
     for _ in range(4):
         (child,) = scene.see(found([box_of(8.0, 1.0, 1.1)])) or (None,)
@@ -158,7 +158,7 @@ HEIGHTS = [1.8, 1.65, 1.72, 1.75, 1.68, 1.7]
 PASSERS_BY = [(9.0, -3.0), (12.0, 2.5), (16.0, -4.0), (20.0, 4.0), (25.0, -5.0), (30.0, 2.0)]
 
 
-def test_who_was_there_first_is_placed_by_the_rise_that_later_ones_tell_and_keeps_it_when_they_leave() -> None:
+def test_tilt_from_later_people_corrects_earlier_ones() -> None:
     scene, first = Scene(), box_of(18.0, 0.5, rise=RISE)
     for _ in range(10):
         people = scene.see(found([first]))
@@ -175,7 +175,7 @@ def test_who_was_there_first_is_placed_by_the_rise_that_later_ones_tell_and_keep
     assert left.cov[0] < alone.cov[0]
 
 
-def test_near_ones_tell_how_tall_all_are_and_far_ones_the_tilt_and_nobody_tells_of_itself() -> None:
+def test_near_people_give_heights_and_far_people_the_tilt() -> None:
     config = PeopleConfig()
     road, camera_m = SharedRoad(config), CAMERA.height_m
     places = [(x_m, y_m) for x_m in (6.5, 8.0, 11.0, 18.0, 28.0, 35.0) for y_m in (-2.0, 2.0)]
@@ -194,7 +194,7 @@ def test_near_ones_tell_how_tall_all_are_and_far_ones_the_tilt_and_nobody_tells_
     assert road.leave_one_out()[-1, 0, 0] == pytest.approx(tilt - 0.005, abs=1e-3)
 
 
-def test_people_on_a_road_that_bends_stand_where_its_rise_puts_them() -> None:
+def test_people_follow_the_vertical_curvature() -> None:
     """A sag as the lanes tell it: over its plane the feet would lie 4 m too far."""
     bend, x_m = 2e-3, 30.0
     box = box_of(x_m, 1.0, rise=bev.rise(x_m - 0.25, bend))
@@ -211,7 +211,7 @@ def test_people_on_a_road_that_bends_stand_where_its_rise_puts_them() -> None:
     assert level_m > bent_m + 1.0
 
 
-def test_feet_that_the_images_border_cuts_tell_no_place() -> None:
+def test_truncated_feet_give_no_position() -> None:
     scene = Scene()
     x1, y1, x2, _ = box_of(3.4, 0.3)
     for _ in range(4):
@@ -220,7 +220,7 @@ def test_feet_that_the_images_border_cuts_tell_no_place() -> None:
     assert abs(person.x_m - 3.4) < 3.0 * math.sqrt(person.cov[0])
 
 
-def test_feet_that_a_car_hides_do_not_move_who_was_seen_before() -> None:
+def test_hidden_feet_do_not_move_a_tracked_person() -> None:
     scene, (x1, y1, x2, y2) = Scene(), box_of(12.0, 2.0)
     for _ in range(6):
         scene.see(found([(x1, y1, x2, y2)]))
@@ -231,7 +231,7 @@ def test_feet_that_a_car_hides_do_not_move_who_was_seen_before() -> None:
     assert person.x_m == pytest.approx(12.0, rel=0.12)
 
 
-def test_covariances_hold_what_boxes_and_heights_really_err() -> None:
+def test_covariances_are_consistent_with_boxes_and_heights() -> None:
     rng, inside = np.random.default_rng(4), []
     for _ in range(40):
         height_m = 1.72 * math.exp(rng.normal(0.0, 0.06))
@@ -249,7 +249,7 @@ def test_covariances_hold_what_boxes_and_heights_really_err() -> None:
 
 
 @pytest.mark.parametrize(("walks_mps", "seed"), [(1.5, 0), (1.5, 1), (-1.2, 0), (-1.2, 1)])
-def test_who_walks_along_the_road_of_a_driving_ego_is_not_taken_to_stand(walks_mps: float, seed: int) -> None:
+def test_walker_beside_a_moving_ego_is_not_stationary(walks_mps: float, seed: int) -> None:
     """Boxes whose error lasts are evidence of one: else whoever expects least, who stands, wins by being repeated."""
     rng, scene, error, told = np.random.default_rng(seed), Scene(ego_mps=6.0), np.zeros(4), list[float]()
     while (x_m := 27.0 + walks_mps * scene.k / HZ - scene.ego_m) > 8.0:
@@ -260,7 +260,7 @@ def test_who_walks_along_the_road_of_a_driving_ego_is_not_taken_to_stand(walks_m
     assert np.median(told) / walks_mps > 0.55
 
 
-def test_a_standing_person_stands_while_the_ego_drives() -> None:
+def test_stationary_person_is_recognized_from_a_moving_ego() -> None:
     rng, scene, told = np.random.default_rng(2), Scene(ego_mps=5.0), []
     for k in range(40):
         box = np.array(box_of(32.0 - scene.ego_m, 3.0))
@@ -271,7 +271,7 @@ def test_a_standing_person_stands_while_the_ego_drives() -> None:
     assert people[0].moves is Moves.STANDING
 
 
-def test_a_walker_has_a_velocity_and_an_id_that_lasts_through_a_second_of_hiding() -> None:
+def test_walker_keeps_velocity_and_id_over_one_second_of_occlusion() -> None:
     scene, ids = Scene(), set()
     for k in range(35):
         y_m = 4.0 - 1.3 * k / HZ
@@ -291,7 +291,7 @@ def test_a_walker_has_a_velocity_and_an_id_that_lasts_through_a_second_of_hiding
     assert people == ()
 
 
-def test_people_whose_boxes_overlap_by_half_stay_apart_and_cross_with_their_ids() -> None:
+def test_overlapping_people_keep_their_ids() -> None:
     scene = Scene()
     for k in range(40):
         left, right = 1.2 - 1.0 * k / HZ, -1.8 + 1.0 * k / HZ
@@ -309,9 +309,7 @@ def test_people_whose_boxes_overlap_by_half_stay_apart_and_cross_with_their_ids(
 @pytest.mark.parametrize(
     ("label", "widths_m", "hidden"), [("person", (0.6, 0.6), 3), ("cyclist", (0.6, 0.6), 0), ("person", (0.4, 0.9), 0)]
 )
-def test_who_is_hidden_takes_not_the_box_of_a_neighbour_that_steps_in_front(
-    label: str, widths_m: tuple[float, float], hidden: int
-) -> None:
+def test_hidden_person_does_not_take_a_neighbours_box(label: str, widths_m: tuple[float, float], hidden: int) -> None:
     """Known by having been unseen for some frames, by the class, by the shape: the box is nearer to the hidden one."""
     scene = Scene()
     for _ in range(10):
@@ -323,7 +321,7 @@ def test_who_is_hidden_takes_not_the_box_of_a_neighbour_that_steps_in_front(
     assert [person.person for person in told if person.age_ns == 0] == [neighbour.person]
 
 
-def test_frames_that_nobody_looked_at_cost_nothing_but_certainty() -> None:
+def test_skipped_frames_only_grow_the_covariance() -> None:
     scene = Scene()
     for _ in range(5):
         scene.see(found([box_of(10.0, 0.0)]))
@@ -363,7 +361,7 @@ def driven(frames: int, *people: FollowedPerson) -> tuple[PoseGraph, Estimate]:
     return graph, estimate
 
 
-def test_people_stand_in_world_with_the_egos_covariance_and_vehicles_stay_apart_from_them() -> None:
+def test_people_have_the_egos_covariance_and_do_not_affect_vehicles() -> None:
     _, estimate = driven(20, person_at(10.0, 2.0, vy=-1.0))
     (user,) = estimate.people
     assert estimate.vehicles == ()
@@ -376,7 +374,7 @@ def test_people_stand_in_world_with_the_egos_covariance_and_vehicles_stay_apart_
     assert user.cov[0] + user.cov[4] > 0.05  # its own, and the ego's
 
 
-def test_the_boxes_of_a_person_are_placed_where_the_person_is_told_to_be() -> None:
+def test_boxes_are_at_the_reported_position() -> None:
     _, estimate = driven(20, person_at(10.0, 2.0, vy=-1.0))
     nobody, rider, bicycle = place_boxes(3, 19, [], [(FIRST_PERSON, (1, 2)), (FIRST_PERSON + 7, (0,))], estimate)
     assert nobody is None
@@ -387,7 +385,7 @@ def test_the_boxes_of_a_person_are_placed_where_the_person_is_told_to_be() -> No
     assert rider.velocity_mps == pytest.approx((0.0, -1.0), abs=0.01)
 
 
-def test_people_go_on_while_no_picture_comes_and_through_a_checkpoint() -> None:
+def test_people_are_predicted_without_images_and_through_a_checkpoint() -> None:
     graph, estimate = driven(10, person_at(10.0, 2.0, vy=-1.0))
     late = msgspec.structs.replace(measured(12, (), 0.0, status=(Status.COASTING,)), cc=None)
     restored = PoseGraph.restore(graph.checkpoint(), GraphConfig(), WeightsConfig())
@@ -409,7 +407,7 @@ def test_a_crowd_is_cut_to_the_nearest_sixty() -> None:
     p=st.tuples(st.floats(3.0, 40.0), st.floats(-8.0, 8.0)), v=st.tuples(st.floats(-15.0, -1.0), st.floats(-2.0, 2.0))
 )
 @settings(max_examples=25)
-def test_the_closest_approach_is_that_of_straight_ways(p: tuple[float, float], v: tuple[float, float]) -> None:
+def test_closest_approach_assumes_constant_velocities(p: tuple[float, float], v: tuple[float, float]) -> None:
     (found,) = approaches(np.array([complex(*p)]), np.array([complex(*v)]), 1e-4 * np.eye(4)[None])
     times = np.linspace(0.0, 30.0, 30_001)
     away = np.hypot(p[0] + v[0] * times, p[1] + v[1] * times)
@@ -422,7 +420,7 @@ def test_the_closest_approach_is_that_of_straight_ways(p: tuple[float, float], v
         assert found.sigma_s == pytest.approx(drawn.std(), rel=0.15)
 
 
-def test_who_crosses_our_way_is_nearby_and_who_walks_away_is_not() -> None:
+def test_crossing_person_is_nearby_and_departing_one_is_not() -> None:
     people = person_at(12.0, 3.0, vy=-1.2), person_at(12.0, 6.0, vy=1.2, number=1), person_at(25.0, 0.0, number=2)
     _, estimate = driven(10, *people)
     crossing, leaving, ahead = (user.approach for user in estimate.people)
@@ -438,7 +436,7 @@ def test_who_crosses_our_way_is_nearby_and_who_walks_away_is_not() -> None:
     assert told.users[0].T_ego_vehicle.x_m == pytest.approx(12.0, abs=0.1)
 
 
-def test_the_road_behind_a_parked_car_is_hidden_and_holds_a_child_before_it_steps_out() -> None:
+def test_hidden_road_behind_a_parked_car_contains_a_child() -> None:
     car = RoadUser(
         vehicle=3, T_world_vehicle=SE2(10.0, 3.0, 0.0), cov=(0.01,) * 9, velocity_mps=(0.0, 0.0), age_ns=0, frames=9,
         velocity_cov=(0.01,) * 4, length_m=4.0, width_m=1.8, height_m=1.5,

@@ -81,7 +81,7 @@ tilings = st.none() | st.builds(Tiles, columns=st.integers(1, 6), overlap=st.flo
 
 
 @given(image_sizes, resizes, tilings, st.data())
-def test_a_box_comes_back_from_the_networks_pixels(
+def test_box_round_trips_through_network_pixels(
     size: tuple[int, int], resize: Stretch | FitPad, tiles: Tiles | None, data: st.DataObject
 ) -> None:
     width_px, height_px = size
@@ -91,7 +91,7 @@ def test_a_box_comes_back_from_the_networks_pixels(
 
 
 @given(image_sizes, resizes, tilings)
-def test_views_cover_the_image_and_lie_in_the_input(
+def test_views_cover_the_image_within_the_input(
     size: tuple[int, int], resize: Stretch | FitPad, tiles: Tiles | None
 ) -> None:
     width_px, height_px = size
@@ -112,7 +112,7 @@ def test_views_cover_the_image_and_lie_in_the_input(
             assert abs(ratio[0] - ratio[1]) <= 1.0 / min(view.x1_px - view.x0_px, height_px)
 
 
-def test_no_more_tiles_than_enlarge_anything() -> None:
+def test_tiles_are_not_more_than_useful() -> None:
     count = {w: len(make_views(w, 376, square_input(), Tiles(columns=3, overlap=0.2))) for w in (300, 376, 640, 1241)}
     assert count == {300: 1, 376: 1, 640: 2, 1241: 3}
 
@@ -158,7 +158,7 @@ def test_only_labelled_classes_above_the_threshold_are_reported() -> None:
     assert found.labels == ("person",)
 
 
-def test_a_network_gone_wild_is_bounded() -> None:
+def test_candidates_are_bounded() -> None:
     reader = decoder()
     view = View(SIZE_PX, SIZE_PX, 0, SIZE_PX, 0, 0, SIZE_PX, SIZE_PX)
     raw = np.zeros((1, 3549, 9), np.float32)
@@ -178,7 +178,7 @@ def iou(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @given(st.lists(boxes_in(200.0, 100.0), min_size=1, max_size=12), st.integers(0, 2**32 - 1))
-def test_nms_keeps_the_best_of_each_heap_whatever_the_order(boxes_list: list[NDArray[np.float64]], seed: int) -> None:
+def test_nms_keeps_the_best_box_in_any_order(boxes_list: list[NDArray[np.float64]], seed: int) -> None:
     rng = np.random.default_rng(seed)
     boxes, n = np.array(boxes_list), len(boxes_list)
     scores, groups, whole = rng.permutation(n) / n, rng.integers(0, 2, n), np.zeros((n, 2), bool)
@@ -219,14 +219,14 @@ def seen_on_tiles(objects: NDArray[np.float64], tiles: Tiles, scores: Any) -> De
 
 
 @given(boxes_in(*WIDE, 12.0), st.integers(2, 4), st.sampled_from([0.1, 0.2, 0.45]))
-def test_an_object_on_tiles_is_one_whole_box(box: NDArray[np.float64], columns: int, overlap: float) -> None:
+def test_object_across_tiles_is_one_box(box: NDArray[np.float64], columns: int, overlap: float) -> None:
     found = seen_on_tiles(box[None], Tiles(columns=columns, overlap=overlap), [0.9])
     assert len(found) == 1
     np.testing.assert_allclose(found.boxes_px[0], box, atol=0.1)
 
 
 @given(st.lists(boxes_in(WIDE[0], 70.0, 12.0), min_size=2, max_size=5), st.integers(0, 2**32 - 1))
-def test_objects_above_each_other_on_tiles_stay_apart(objects: list[NDArray[np.float64]], seed: int) -> None:
+def test_vertically_separate_objects_are_not_joined(objects: list[NDArray[np.float64]], seed: int) -> None:
     boxes = np.array([np.add(box, [0, 75 * i, 0, 75 * i]) for i, box in enumerate(objects)])
     found = seen_on_tiles(
         boxes, Tiles(columns=3, overlap=0.2), np.random.default_rng(seed).uniform(0.4, 1.0, len(boxes))
@@ -235,7 +235,7 @@ def test_objects_above_each_other_on_tiles_stay_apart(objects: list[NDArray[np.f
 
 
 @given(st.lists(st.integers(20, 300), min_size=2, max_size=8), st.floats(1.0, 30.0), st.integers(0, 2**32 - 1))
-def test_objects_beside_each_other_on_tiles_stay_apart(widths: list[int], gap_px: float, seed: int) -> None:
+def test_horizontally_separate_objects_are_not_joined(widths: list[int], gap_px: float, seed: int) -> None:
     left = np.cumsum([0.0, *[w + gap_px for w in widths]])
     boxes = np.array([[x, 150, x + w, 220] for x, w in zip(left[:-1], widths, strict=True) if x + w <= WIDE[0]])
     found = seen_on_tiles(
@@ -244,7 +244,7 @@ def test_objects_beside_each_other_on_tiles_stay_apart(widths: list[int], gap_px
     np.testing.assert_allclose(found.boxes_px[np.argsort(found.boxes_px[:, 0])], boxes, atol=0.1)
 
 
-def test_a_cut_box_does_not_survive_beside_the_whole_one_though_it_scores_better() -> None:
+def test_cut_box_yields_to_the_whole_one() -> None:
     reader = decoder()
     views = make_views(*WIDE, square_input(), Tiles(columns=2, overlap=0.2))
     edge_px = views[0].x1_px
@@ -293,7 +293,7 @@ def write(network: Path, manifest: str) -> ModelSpec:
     return ModelSpec(str(network))
 
 
-def test_masks_lie_where_their_class_is(tmp_path: Path) -> None:
+def test_masks_follow_their_class(tmp_path: Path) -> None:
     """The network echoes its input, so that colours are classes: green is road, red above the threshold is a lane."""
     spec = write(tiny.echo(tmp_path / "a.onnx", (1, 3, 64, 64), outputs=("output", "more")), SEGMENTER)
     image = np.zeros((100, 400, 3), np.uint8)
@@ -327,7 +327,7 @@ def test_images_of_any_size(tmp_path: Path, shape: tuple[int, ...]) -> None:
 @pytest.mark.parametrize(
     "image", [np.zeros((4, 4), np.float32), np.zeros((4, 4, 4), np.uint8), np.zeros((0, 4), np.uint8)]
 )
-def test_what_is_no_image_is_refused(tmp_path: Path, image: NDArray[Any]) -> None:
+def test_invalid_image_is_refused(tmp_path: Path, image: NDArray[Any]) -> None:
     network = load_network(
         "segmenter", write(tiny.echo(tmp_path / "a.onnx", (1, 3, 64, 64), outputs=("output", "more")), SEGMENTER)
     )
@@ -335,7 +335,7 @@ def test_what_is_no_image_is_refused(tmp_path: Path, image: NDArray[Any]) -> Non
         network.run(image)
 
 
-def test_numbers_that_are_none_are_a_status_and_the_last_result_is_carried(tmp_path: Path) -> None:
+def test_non_finite_output_is_a_status_and_carries_the_last_result(tmp_path: Path) -> None:
     answer = encode(np.array([[32.0, 8.0, 96.0, 24.0]]), [0], [0.8])["output"]
     spec = write(tiny.constant(tmp_path / "a.onnx", (1, 3, SIZE_PX, SIZE_PX), answer), DETECTOR)
     white, black = np.full((60, 80), 255, np.uint8), np.zeros((60, 80), np.uint8)
@@ -435,7 +435,7 @@ def test_a_late_head_is_carried_with_its_age_and_never_run_twice_at_once() -> No
     assert now.status == ()
 
 
-def test_a_head_that_no_frame_awaits_is_awaited_where_patience_has_no_end() -> None:
+def test_unawaited_head_is_awaited_without_patience_limit() -> None:
     lazy = FakeHead("segmenter", "segmenter", Schedule(awaited=False))
     executor = Executor()
     networks = Networks([lazy, FakeHead()], executor.submit, patience_s=30.0)
@@ -471,7 +471,7 @@ def test_a_frame_without_pixels_starts_nothing_and_carries() -> None:
     assert blind.status == (Status.DETECTIONS_CARRIED,)
 
 
-def test_a_source_that_begins_anew_forgets_the_old_frames() -> None:
+def test_restarted_source_discards_old_results() -> None:
     executor = Executor()
     networks = Networks([FakeHead()], executor.submit, patience_s=0.0)
     step(networks, executor, 7)
@@ -484,7 +484,7 @@ def test_a_source_that_begins_anew_forgets_the_old_frames() -> None:
 
 
 @given(st.integers(1, 3), st.integers(1, 4), st.lists(st.integers(1, 3), min_size=1, max_size=20))
-def test_masks_come_every_nth_run_and_are_predicted_between(slowdown: int, masks: int, gaps: list[int]) -> None:
+def test_masks_come_every_nth_run(slowdown: int, masks: int, gaps: list[int]) -> None:
     executor, alone = Executor(), object()
     head = FakeHead("multitask", "multitask")
     networks = Networks([head], executor.submit, boxes_alone=alone)  # type: ignore[arg-type]
@@ -510,7 +510,7 @@ def test_masks_come_every_nth_run_and_are_predicted_between(slowdown: int, masks
         assert (Status.DETECTIONS_CARRIED in perception.status) == (looks[-1] != frame_id)
 
 
-def test_the_shipped_network_says_the_same_of_boxes_without_its_masks() -> None:
+def test_boxes_of_shipped_network_do_not_depend_on_masks() -> None:
     spec = ModelSpec(str(SHIPPED_NETWORKS / "multitask_int8.onnx"))
     network = load_network("multitask", spec, 1, ("depth",), ("segmentation",))
     image = np.random.default_rng(3).integers(0, 255, (96, 320, 3), np.uint8)
@@ -587,7 +587,7 @@ def test_the_road_ahead_is_road_and_the_sky_is_not(data_dir: Path, models_dir: P
 
 
 @pytest.mark.parametrize(("role", "name"), [("detector", "yolox_nano_416"), ("segmenter", "twinlitenet_640x360")])
-def test_grey_and_colour_alike_and_twice_the_same(data_dir: Path, models_dir: Path, role: str, name: str) -> None:
+def test_grey_and_colour_agree_and_are_deterministic(data_dir: Path, models_dir: Path, role: str, name: str) -> None:
     grey = frame(data_dir, SEQUENCE_00, 50)
     images = [grey, cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), grey]
     network = load_network(role, ModelSpec(str(models_dir / f"{name}.onnx")))
@@ -614,7 +614,7 @@ overlap = 0.2
 )
 
 
-def test_a_square_detector_looks_at_each_tile_that_its_manifest_states(tmp_path: Path) -> None:
+def test_detector_runs_on_each_tile(tmp_path: Path) -> None:
     """A network that sees one box wherever it looks sees it once in each tile, enlarged as the tile is."""
     box = np.array([[40.0, 10.0, 60.0, 40.0]])
     path = tiny.constant(tmp_path / "a.onnx", (1, 3, SIZE_PX, SIZE_PX), encode(box, [0], [0.9])["output"])

@@ -1,4 +1,4 @@
-"""The perf suite: its statistics on known data, and ratios to peers within the bounds of the reference."""
+"""The perf suite: its statistics on known data, and ratios to alternatives within the reference's bounds."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_a_spread_is_ordered_and_within_its_series(values: list[float]) -> None:
     assert list(points) == sorted(points)
 
 
-def test_nothing_measured_gives_no_figure() -> None:
+def test_empty_series_has_no_result() -> None:
     assert spread([]) == {"n": 0}
     assert curve([]) == []
     assert noise("age_ms", [1.0] * (2 * BLOCKS - 1)) == {}
@@ -68,7 +68,7 @@ def test_compare_calls_noise_not_distinguishable() -> None:
         assert set(verdicts.values()) == {"not distinguishable"}
 
 
-def test_compare_sees_what_changed_and_in_which_direction() -> None:
+def test_compare_finds_changes_and_their_direction() -> None:
     worse = _verdicts([_report(1.0, 1)], [_report(1.5, 2, dropped=200, exact=0.6)])
     better = _verdicts([_report(1.5, 2, dropped=200, exact=0.6)], [_report(1.0, 1)])
     assert set(worse) == {
@@ -81,7 +81,7 @@ def test_compare_sees_what_changed_and_in_which_direction() -> None:
     assert set(better.values()) == {"better"}
 
 
-def test_compare_does_not_care_for_a_small_shift_however_sure() -> None:
+def test_compare_ignores_small_shifts() -> None:
     assert set(_verdicts([_report(1.0, 1)] * 9, [_report(1.02, 1)] * 9).values()) == {"not distinguishable"}
 
 
@@ -106,7 +106,7 @@ def _cut_short(path: Path) -> None:
         raise KeyboardInterrupt
 
 
-def test_a_ledger_keeps_what_was_measured_when_it_is_cut_short(tmp_path: Path) -> None:
+def test_interrupted_ledger_keeps_its_rows(tmp_path: Path) -> None:
     path = tmp_path / "some" / "figures.json"
     with pytest.raises(KeyboardInterrupt):
         _cut_short(path)
@@ -173,7 +173,7 @@ def test_budgets_are_those_of_the_configuration() -> None:
     assert broken == {"perceive_ms"}
 
 
-def test_what_waits_for_a_node_is_in_that_node_s_budget_and_not_in_the_hop_s() -> None:
+def test_waiting_time_counts_for_the_node_not_the_hop() -> None:
     run = _run(40.0)
     for number in range(100, 110):
         was = run.messages[number]
@@ -271,7 +271,7 @@ def _content(benchmarks: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def test_a_report_shows_what_is_there_and_names_what_is_not(tmp_path: Path) -> None:
+def test_report_names_missing_results(tmp_path: Path) -> None:
     run = system.figures(_run(11.0)) | {"steal_during_percent": 0.5}
     row = {
         **{"carrier": "ring", "bytes": 200, "rate_hz": 33, "load": 0, "sent": 100, "dropped": 1, "steal_percent": 0.0},
@@ -325,7 +325,7 @@ def test_a_ring_that_is_slower_than_zenoh_fails() -> None:
 
 @pytest.mark.slow  # a ratio of times, which neighbours disturb
 @pytest.mark.processes
-def test_ours_over_its_peers_has_not_got_worse() -> None:
+def test_ratios_are_within_bounds() -> None:
     """Ratios of one machine at one time, the median of three rounds."""
     bounds, found = ratios.reference(), ratios.measure(3)
     assert found.keys() == bounds.keys()
@@ -348,7 +348,7 @@ def test_interrupting_the_suite_keeps_what_it_has(tmp_path: Path, monkeypatch: p
     assert "optimizer: interrupted" in (tmp_path / "report.md").read_text()
 
 
-def test_without_the_renderer_a_benchmark_and_the_demo_drive_say_what_is_missing(
+def test_missing_renderer_is_named(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     """As from a wheel, which has neither `birdslam.world` nor `birdslam.runtime.world`."""

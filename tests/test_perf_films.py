@@ -1,4 +1,4 @@
-"""`python -m perf films`: variants of a film are driven by one camera, and chance is among them."""
+"""`python -m perf films`: all variants of a film use one fixed camera; noise is one of the variants."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ CAMERA = Camera(640, 360, 500.0, 500.0, 320.0, 180.0, 1.4)
 
 
 @pytest.mark.parametrize("name", FILMS)
-def test_a_films_camera_is_that_of_its_file_each_day(name: str) -> None:
+def test_film_camera_is_that_of_its_file(name: str) -> None:
     camera = camera_of(name)
     if FILMS[name].height_m is None:
         assert camera is None  # the recording has its own
@@ -23,13 +23,13 @@ def test_a_films_camera_is_that_of_its_file_each_day(name: str) -> None:
         assert camera.height_m == FILMS[name].height_m
 
 
-def test_no_camera_file_is_left_of_a_film_that_is_gone() -> None:
+def test_every_camera_file_has_a_film() -> None:
     assert {path.stem for path in CAMERAS.iterdir()} == {
         name for name, film in FILMS.items() if film.height_m is not None
     }
 
 
-def test_draws_of_noise_differ_repeat_and_are_hardly_seen() -> None:
+def test_noise_draws_differ_are_repeatable_and_invisible() -> None:
     unchanged, *draws = variants(CAMERA, "noise")
     image = np.full((36, 64, 3), 120, np.uint8)
     assert unchanged.shown is None

@@ -276,7 +276,7 @@ def test_three_processes_give_the_bytes_of_one(drive: Path, place: Path) -> None
     assert run.left_behind() == []
 
 
-def test_an_evaluation_tells_the_path_of_the_drive(drive: Path, place: Path) -> None:
+def test_evaluation_prints_the_path_of_the_drive(drive: Path, place: Path) -> None:
     assert len(evaluate(drive, place / "a", "--model", "none").splitlines()) == FRAMES
     report = json.loads((place / "a" / "report.json").read_text())
     assert [(row["sequence"], row["frames"]) for row in report] == [("77", FRAMES)]
@@ -387,7 +387,7 @@ def test_without_restarts_a_stalled_node_ends_the_run_with_its_name(drive: Path,
         (["--output", "{place}/file/out"], "file/out"),
     ],
 )
-def test_what_a_user_has_to_mend_is_named_before_anything_starts(
+def test_user_errors_are_named_before_start(
     drive: Path, place: Path, arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (place / "file").touch()
@@ -425,7 +425,7 @@ def test_a_manifest_that_does_not_fit_its_network(
     assert err.count("\n") == 1
 
 
-def test_a_killed_capture_goes_on_in_its_recording_until_it_dies_too_often(drive: Path, place: Path) -> None:
+def test_killed_capture_resumes_until_it_fails_too_often(drive: Path, place: Path) -> None:
     with Run(
         *(place, "--source", f"kitti:{drive}", "--set", "source.loop=true", *UNHURRIED),
         *("--set", "runtime.spares=true", "--set", "runtime.restarts_max=1"),

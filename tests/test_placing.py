@@ -1,4 +1,4 @@
-"""Vehicles that the image's border cuts: their true bottom lies below it, so that they are no farther than that."""
+"""Vehicles truncated by the lower image border: the true lower edge bounds their distance."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def depths(log_depth: float, sigma: float) -> Depths:
     return Depths(*(np.array([value]) for value in (log_depth, sigma**2, 0.42, 0.0064, 0.9)))
 
 
-def test_only_a_bottom_that_the_image_cuts_is_a_bound() -> None:
+def test_only_a_truncated_lower_edge_is_a_bound() -> None:
     assert seen_at(20.0, 2.0).sigma_cut is None
     cut = seen_at(5.0, 1.0)
     assert cut.sigma_cut is not None
@@ -51,7 +51,7 @@ def test_only_a_bottom_that_the_image_cuts_is_a_bound() -> None:
 
 
 @pytest.mark.parametrize(("depth_m", "sigma"), [(12.0, 0.5), (6.0, 0.3), (4.0, 0.2), (3.0, 1.5)])
-def test_the_moments_are_those_of_the_depth_given_the_bound(depth_m: float, sigma: float) -> None:
+def test_moments_are_those_of_the_truncated_distribution(depth_m: float, sigma: float) -> None:
     ground_size, cut = GroundSizeFilter(CAMERA, GroundSizeConfig()), seen_at(5.0, 1.0)
     found = truncate_at_cut(depths(math.log(depth_m), sigma), [cut], ground_size, 0.0)
     assert cut.sigma_cut is not None
@@ -66,7 +66,7 @@ def test_the_moments_are_those_of_the_depth_given_the_bound(depth_m: float, sigm
     assert found.depth_per_height[0] / 0.9 == pytest.approx(found.variance[0] / sigma**2)
 
 
-def test_a_depth_far_past_the_bound_gives_finite_numbers() -> None:
+def test_depth_far_beyond_the_bound_gives_finite_numbers() -> None:
     ground_size, cut = GroundSizeFilter(CAMERA, GroundSizeConfig()), seen_at(5.0, 1.0)
     found = truncate_at_cut(depths(8.0, 0.01), [cut], ground_size, 0.0)
     assert np.isfinite(found.log_depth).all()
@@ -74,7 +74,7 @@ def test_a_depth_far_past_the_bound_gives_finite_numbers() -> None:
     assert 0.0 < found.variance[0] < 1e-4
 
 
-def test_cars_beside_the_ego_are_not_thought_far_ahead() -> None:
+def test_cars_beside_the_ego_are_not_placed_far_ahead() -> None:
     errors = []
     for x_m in np.arange(3.5, 7.0, 0.5):
         for side in (-3.3, 3.3):

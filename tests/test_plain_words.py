@@ -1,4 +1,4 @@
-"""The verdict on a drive: every status has a meaning, and no sentence claims more than the counts show."""
+"""The summary of a drive: every status has a meaning, and no sentence claims more than the counts."""
 
 from __future__ import annotations
 
@@ -37,9 +37,7 @@ def test_every_status_has_a_meaning() -> None:
 
 
 @given(st.integers(0, 10_000), st.data())
-def test_the_share_is_100_percent_only_where_all_is_valid_and_0_only_where_nothing_is(
-    frames: int, data: st.DataObject
-) -> None:
+def test_share_is_100_percent_only_if_all_frames_are_valid(frames: int, data: st.DataObject) -> None:
     invalid = data.draw(st.integers(0, frames))
     first, *_ = verdict(drive(frames, invalid))
     if not frames:
@@ -54,7 +52,7 @@ def test_the_share_is_100_percent_only_where_all_is_valid_and_0_only_where_nothi
         assert share == pytest.approx(100.0 * (frames - invalid) / frames, abs=1.0)
 
 
-def test_a_film_that_was_cut_off_is_reported_once() -> None:
+def test_truncated_film_is_reported_once() -> None:
     assert sum("cut off" in said for said in verdict(drive(100, 1, ends_unreadable=True))) == 1
     assert not any("cut off" in said for said in verdict(drive(100, 1, invalid_by={"frame_unreadable": 1})))
 
@@ -67,7 +65,7 @@ def test_reasons_are_listed_by_frequency() -> None:
     assert any("--speed FILE" in line for line in said)
 
 
-def test_an_unmeasured_height_is_the_next_thing_to_measure() -> None:
+def test_unmeasured_height_is_recommended_to_measure() -> None:
     by_cars = LengthsBy("the camera's height of 1.40 m (by the size of 12 cars, +- 11%)", 0.11)
     said = verdict(drive(scale_sigma_rel=0.12, camera_sigma_rel=0.11, lengths_by=by_cars))
     assert any("Lengths are accurate to 12%" in line and by_cars.words in line for line in said)
@@ -99,7 +97,7 @@ PLACES = st.builds(SE2, st.floats(-500.0, 500.0), st.floats(-500.0, 500.0), st.f
 
 
 @given(PLACES, PLACES, st.floats(-30.0, 30.0), st.floats(-30.0, 30.0), st.floats(0.001, 0.3))
-def test_an_unsure_scale_moves_everything_along_its_own_place(
+def test_uncertain_scale_affects_all_distances(
     ego: SE2, car: SE2, u_mps: float, v_mps: float, sigma_rel: float
 ) -> None:
     vehicle = VehicleEstimate(

@@ -1,4 +1,4 @@
-"""Motions that no car makes: not believed, nor what follows until all is steady, and then in a new world."""
+"""Implausible motions: rejected until the motion is steady, then a new epoch starts."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ def moved(frame: int, speed_mps: float, status: tuple[Status, ...] = ()) -> Meas
     )
 
 
-def test_a_hard_braking_car_is_believed() -> None:
+def test_hard_braking_is_plausible() -> None:
     gate = PlausibilityGate(PlausibilityConfig())
     drive = [moved(frame, max(0.0, 15.0 - frame)) for frame in range(1, 30)]
     assert [gate.admit(m) for m in drive] == drive
 
 
-def test_a_reversal_is_not_and_the_world_begins_anew_when_all_is_steady() -> None:
+def test_reversal_is_implausible_and_starts_a_new_epoch() -> None:
     gate = PlausibilityGate(PlausibilityConfig(steady_s=0.5))
     judged = [gate.admit(moved(frame, 10.0 if frame < 5 else -10.0)) for frame in range(1, 14)]
     wrong = [m.frame_id for m in judged if Status.MOTION_IMPLAUSIBLE in m.status]
@@ -34,7 +34,7 @@ def test_a_reversal_is_not_and_the_world_begins_anew_when_all_is_steady() -> Non
     assert Status.MOTION_IMPLAUSIBLE in INVALIDATING
 
 
-def test_what_is_only_predicted_is_not_steady() -> None:
+def test_predicted_motion_is_not_steady() -> None:
     gate = PlausibilityGate(PlausibilityConfig(steady_s=0.5))
     for frame in range(1, 6):
         gate.admit(moved(frame, 10.0 if frame < 5 else -10.0))
@@ -43,7 +43,7 @@ def test_what_is_only_predicted_is_not_steady() -> None:
         assert Status.MOTION_IMPLAUSIBLE in gate.admit(moved(frame, -10.0, coasts)).status
 
 
-def test_after_a_long_blindness_the_world_begins_anew() -> None:
+def test_long_blindness_starts_a_new_epoch() -> None:
     gate = PlausibilityGate(PlausibilityConfig(blind_s=0.5, steady_s=0.5))
     blind = (Status.ODOMETRY_COASTING,)
     judged = [gate.admit(moved(frame, 10.0, blind if 5 <= frame < 15 else ())) for frame in range(1, 24)]
@@ -60,7 +60,7 @@ def at_33_hz(steps_m: list[float]) -> list[Measurements]:
     return out
 
 
-def test_the_noise_of_single_motions_at_33_hz_is_believed() -> None:
+def test_noise_of_single_motions_at_33_hz_is_plausible() -> None:
     """0.03 m of noise, 1-sigma, in each motion, as the shipped drive shows: 1 m/s in the speed of one of them."""
     rng, gate = np.random.default_rng(3), PlausibilityGate(PlausibilityConfig())
     drive = at_33_hz((10.0 / 33.0 + rng.normal(0.0, 0.03, 400)).tolist())

@@ -1,4 +1,4 @@
-"""Frustum-PointNet by manifest: the points that it is given, and its answers back in the camera."""
+"""Frustum-PointNet by manifest: its input points, and its outputs transformed to the camera."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ ANSWER = [
 ]
 
 
-def test_a_body_comes_back_to_the_camera(tmp_path: Path) -> None:
+def test_body_round_trips_to_the_camera(tmp_path: Path) -> None:
     network = load_pointnet(ModelSpec(str(body(tmp_path, ANSWER))))
     points = patch()
     found = network.locate([points, points], ["car", "car"], CAMERA)  # a fixed batch of one is run twice
@@ -100,7 +100,7 @@ def test_a_body_comes_back_to_the_camera(tmp_path: Path) -> None:
     assert (found.sigma_alpha_rad < 0.1).all()
 
 
-def test_the_front_may_be_the_other_end(tmp_path: Path) -> None:
+def test_front_may_be_reversed(tmp_path: Path) -> None:
     flipped = [*ANSWER[:9], -2.0, -1.0, -2.0]
     found = load_pointnet(ModelSpec(str(body(tmp_path, flipped)))).locate([patch(0.0)], ["car"], CAMERA)
     assert found is not None
@@ -129,7 +129,7 @@ def test_frustum_pointnets_own_outputs(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.sigma_depth_m, 0.05 * 14.0)
 
 
-def test_a_box_without_points_has_a_body_of_which_nothing_is_known(tmp_path: Path) -> None:
+def test_box_without_points_has_an_unknown_body(tmp_path: Path) -> None:
     network = load_pointnet(ModelSpec(str(body(tmp_path, ANSWER))))
     found = network.locate([patch()[:10], patch()], ["car", "car"], CAMERA)
     assert found is not None
@@ -139,7 +139,7 @@ def test_a_box_without_points_has_a_body_of_which_nothing_is_known(tmp_path: Pat
     assert len(nothing) == 0
 
 
-def test_a_network_without_numbers_says_so(tmp_path: Path) -> None:
+def test_non_finite_output_is_reported(tmp_path: Path) -> None:
     network = load_pointnet(ModelSpec(str(body(tmp_path, [math.nan, *ANSWER[1:]]))))
     assert network.locate([patch()], ["car"], CAMERA) is None
 
@@ -171,7 +171,7 @@ def test_a_network_of_another_shape_is_refused(tmp_path: Path) -> None:
 
 
 @given(st.floats(-0.6, 0.6), st.floats(4.0, 40.0))
-def test_points_turned_and_centred_come_back(slope: float, z_m: float) -> None:
+def test_rotated_and_centred_points_round_trip(slope: float, z_m: float) -> None:
     points = patch(slope * z_m, z_m)
     frustum = frustum_of(points, Points(name="p", count=64, features=("x", "y", "z", "u", "v", "log_depth")))
     assert frustum is not None

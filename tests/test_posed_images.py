@@ -50,7 +50,7 @@ def along(count: int, turn_rad: float = 0.0) -> list[np.ndarray]:
 
 
 @given(st.integers(0, 1000), st.floats(-0.01, 0.01))
-def test_points_of_exact_images_are_where_they_are(seed: int, turn_rad: float) -> None:
+def test_exact_images_give_exact_points(seed: int, turn_rad: float) -> None:
     points = ahead(20, seed)
     found = views(points, along(6, turn_rad)).points()
     assert found
@@ -59,7 +59,7 @@ def test_points_of_exact_images_are_where_they_are(seed: int, turn_rad: float) -
         assert point.error_px < 1e-6
 
 
-def test_a_moving_corner_is_no_point() -> None:
+def test_moving_feature_is_not_a_point() -> None:
     posed = views(ahead(1), along(6))
     for k, image in enumerate(posed.images):
         image.px[0, 1] += 15.0 * k
@@ -180,7 +180,7 @@ def test_trajectories_are_the_cameras(drive: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("form", FORMATS)
-def test_what_can_not_be_exported_is_one_line(drive: Path, tmp_path: Path, form: str) -> None:
+def test_export_errors_are_one_line(drive: Path, tmp_path: Path, form: str) -> None:
     taken = tmp_path / "taken"
     taken.write_text("mine")
     with pytest.raises(ResultsError, match="exists already"):

@@ -1,4 +1,4 @@
-"""Progress: a refreshed line on a terminal, a line a minute elsewhere, and a time to go only once it is known."""
+"""Progress: a refreshed line on a terminal, a line per minute elsewhere, remaining time once it is known."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_times_to_go(seconds: float, text: str) -> None:
     assert time_to_go(seconds) == text
 
 
-def test_the_time_to_go_is_that_of_the_pieces_after_the_first() -> None:
+def test_remaining_time_ignores_the_first_item() -> None:
     clock, stream = Clock(), Terminal()
     with Progress("drive", 11, stream=stream, clock=clock) as progress:
         clock.now_s += 60.0  # loading
@@ -55,7 +55,7 @@ def test_a_second_pass_and_an_unknown_end() -> None:
     assert progress.line(clock.now_s) == "replay: 0.5 of 4.5 MB"
 
 
-def test_no_terminal_has_a_line_a_minute() -> None:
+def test_without_terminal_there_is_one_line_per_minute() -> None:
     clock, stream = Clock(), io.StringIO()
     with Progress("drive", 1000, stream=stream, clock=clock) as progress:
         for _ in range(150):

@@ -1,4 +1,4 @@
-"""What computes networks: the choice by measurement and agreement, and the way back to the CPU, which is told."""
+"""Execution providers: selection by measurement and agreement, and the reported fallback to the CPU."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def by(provider: str | None) -> ModelSpec:
     return msgspec.structs.replace(SHIPPED, provider=provider)
 
 
-def test_what_is_not_there_gives_way_to_the_cpu_and_says_so() -> None:
+def test_missing_provider_falls_back_to_cpu_with_reason() -> None:
     fallen, cpu = load_network("multitask", by(ABSENT)), load_network("multitask", by("cpu"))
     assert (fallen.provider, cpu.provider, cpu.fell_back) == ("cpu", "cpu", "")
     assert f"has no {ABSENT}, but cpu" in fallen.fell_back
@@ -42,7 +42,7 @@ def test_what_is_not_there_gives_way_to_the_cpu_and_says_so() -> None:
     assert load_network("multitask", by("auto")).provider == "cpu"
 
 
-def test_each_frame_says_that_a_network_fell_back() -> None:
+def test_each_frame_reports_the_fallback() -> None:
     for provider, said in ((ABSENT, True), ("cpu", False), ("auto", False)):
         config = Configuration(source=SourceConfig(rate="max"), perceive=PerceiveConfig(provider=provider))
         with Inference(config) as inference:
@@ -52,7 +52,7 @@ def test_each_frame_says_that_a_network_fell_back() -> None:
 
 
 @stand_in
-def test_an_accelerator_that_fails_on_the_way_gives_way_to_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failing_accelerator_falls_back_to_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(session.EXECUTION_PROVIDERS, "cuda", session.CPU)
     network, cpu = load_network("multitask", by("cuda")), load_network("multitask", by("cpu"))
     assert network.provider == "cuda"
@@ -119,7 +119,7 @@ def figures(monkeypatch: pytest.MonkeyPatch, **found: Measured) -> list[Any]:
     return calls
 
 
-def test_auto_takes_what_wins_and_agrees(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_auto_selects_the_fastest_agreeing_provider(monkeypatch: pytest.MonkeyPatch) -> None:
     cpu = Measured(10.0, 0.0)
     for openvino, wanted in (
         (Measured(6.0, 0.001), "openvino"),
@@ -164,12 +164,12 @@ def test_doctor_lists_what_is_there(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif("openvino" not in session.providers_here(), reason="onnxruntime-openvino is not installed")
-def test_openvino_gives_what_the_cpu_gives() -> None:
+def test_openvino_agrees_with_cpu() -> None:
     assert compared("multitask", SHIPPED, ("cpu", "openvino"), within_s=0.0)["openvino"].agrees
 
 
 @stand_in
-def test_an_accelerator_whose_libraries_are_missing_gives_way_to_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_libraries_fall_back_to_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
     """As TensorRT does without its own: a RuntimeError of another kind than a session's."""
     begin = session.ort.InferenceSession
 

@@ -1,4 +1,4 @@
-"""Vehicles by their depth: exact on exact depth, honest about noise, and put together with Eq. 1 by covariance."""
+"""Vehicles from depth: exact on exact depth, consistent with noise, fused with Eq. 1 by covariance."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def axis_error(a_rad: float, b_rad: float) -> float:
 
 @settings(max_examples=60)
 @given(st.floats(8.0, 35.0), st.floats(-0.35, 0.35), st.floats(-math.pi, math.pi))
-def test_exact_depth_gives_the_place_and_the_axis(x_m: float, bearing: float, yaw_rad: float) -> None:
+def test_exact_depth_gives_position_and_axis(x_m: float, bearing: float, yaw_rad: float) -> None:
     pose = SE2(x_m, bearing * x_m, yaw_rad)
     depth, boxes = scene([pose], (188, 621))
     found = fit_footprint(observed(boxes)[0], depth, CAMERA, CAMERA.ground, CONFIG)
@@ -82,7 +82,7 @@ def test_exact_depth_gives_the_place_and_the_axis(x_m: float, bearing: float, ya
     assert axis_error(found.yaw_rad, yaw_rad) < max(3.0 * found.sigma_yaw_rad, 0.15)
 
 
-def test_near_and_oblique_the_axis_is_sharp() -> None:
+def test_axis_is_accurate_near_and_oblique() -> None:
     for degrees in (20, 45, 70, 110, 150):
         depth, boxes = scene([SE2(10.0, 1.0, math.radians(degrees))])
         found = fit_footprint(observed(boxes)[0], depth, CAMERA, CAMERA.ground, CONFIG)
@@ -91,7 +91,7 @@ def test_near_and_oblique_the_axis_is_sharp() -> None:
         assert found.sigma_yaw_rad < math.radians(15)
 
 
-def test_noise_of_the_map_lies_in_the_covariance() -> None:
+def test_covariance_covers_depth_noise() -> None:
     rng = np.random.default_rng(5)
     d2 = []
     for _ in range(60):
@@ -110,7 +110,7 @@ def test_noise_of_the_map_lies_in_the_covariance() -> None:
     assert np.mean(np.array(d2) < 6.18) > 0.9
 
 
-def test_no_place_where_the_depth_says_nothing() -> None:
+def test_no_position_without_usable_depth() -> None:
     depth, boxes = scene([SE2(12.0, 0.0, 0.0)])
     (seen,) = observed(boxes)
     tiny = DepthMap(depth.depth_m[:8, :8], 1242, 375)  # too few columns in the box
@@ -121,7 +121,7 @@ def test_no_place_where_the_depth_says_nothing() -> None:
     assert locate_in_depth_map([], depth, CAMERA, CAMERA.ground, CONFIG) == []
 
 
-def test_a_map_without_a_scale_gets_it_from_the_road() -> None:
+def test_unscaled_depth_map_is_scaled_by_the_road() -> None:
     depth, boxes = scene([SE2(12.0, 3.0, 0.3)])
     u, v = np.meshgrid(np.arange(1242), np.arange(375))
     road = (v > 220) & ((u < boxes[0, 0]) | (u > boxes[0, 2]))
@@ -169,7 +169,7 @@ def told(poses: list[SE2]) -> Boxes3d:
     )
 
 
-def test_the_network_is_asked_for_boxes_with_points_and_its_answers_are_places_in_ego() -> None:
+def test_network_gets_boxes_with_points_and_gives_poses_in_ego() -> None:
     poses = [SE2(10.0, 2.0, 0.4), SE2(55.0, -3.0, 2.0)]
     depth, boxes = scene(poses)
     network = Told(told(poses))
@@ -194,7 +194,7 @@ def found_with(poses: list[SE2], bodies: Boxes3d) -> Detections:
     return Detections(boxes, np.linspace(0.9, 0.8, len(boxes)), ("car",) * len(boxes), bodies)
 
 
-def test_bodies_that_the_detector_knows_of_are_the_second_source() -> None:
+def test_bodies_of_the_detector_are_the_second_source() -> None:
     poses = [SE2(10.0, 2.0, 0.4), SE2(25.0, -3.0, 2.0)]
     detections = found_with(poses, told(poses))
     seen = observed(detections.boxes_px)[::-1]  # as bodies go with their boxes, the order is of no matter
@@ -212,7 +212,7 @@ def test_bodies_that_the_detector_knows_of_are_the_second_source() -> None:
     assert locate_detected_bodies(seen, without, CAMERA, CAMERA.ground, CONFIG) == (seen, [None, None])
 
 
-def test_of_boxes_that_are_equal_each_keeps_its_own_body() -> None:
+def test_equal_boxes_keep_their_own_bodies() -> None:
     bodies = told([SE2(10.0, 2.0, 0.4), SE2(12.0, 2.4, 0.4)])
     detections = found_with([SE2(10.0, 2.0, 0.4)], bodies)
     boxes_px, scores = detections.boxes_px.repeat(2, axis=0), np.array([0.9, 0.8])
@@ -225,7 +225,7 @@ def test_of_boxes_that_are_equal_each_keeps_its_own_body() -> None:
 
 
 @given(st.floats(3.0, 7.0), st.floats(0.05, 3.0), st.floats(8.0, 40.0), st.floats(-math.pi, math.pi))
-def test_the_length_is_of_class_and_body_together_and_the_face_stays(
+def test_length_fuses_class_and_body_and_keeps_the_face(
     length_m: float, sigma_m: float, x_m: float, yaw_rad: float
 ) -> None:
     poses = [SE2(x_m, 0.0, yaw_rad)]
@@ -266,7 +266,7 @@ def by_depth(x_m: float = 20.0, var: float = 4.0) -> DepthPlace:
     return DepthPlace(np.array([x_m, 1.2]), np.diag([var, 0.04]), 0.0, 0.1)
 
 
-def test_two_sources_are_better_than_one() -> None:
+def test_fusion_reduces_the_covariance() -> None:
     both = fuse(by_box(20.0), by_depth(21.0), CONFIG)
     np.testing.assert_allclose(both.centre_m, [20.5, 1.0])  # sideways both rest on the edges of the one box
     np.testing.assert_allclose(both.cov, np.diag([2.0, 0.04]))
@@ -275,13 +275,13 @@ def test_two_sources_are_better_than_one() -> None:
     assert sure.centre_m[0] == pytest.approx(21.0, abs=1e-3)
 
 
-def test_sources_that_contradict_each_other_are_both_believed_less() -> None:
+def test_contradicting_sources_grow_the_covariance() -> None:
     both = fuse(by_box(20.0), by_depth(60.0), CONFIG)
     assert both.centre_m[0] == pytest.approx(40.0)
     assert both.cov[0, 0] > by_box().cov[0, 0]
 
 
-def test_the_papers_rule_asks_the_depth() -> None:
+def test_papers_rule_uses_the_depth() -> None:
     config = PseudoLidarConfig(rule="paper")
     near, far = fuse(by_box(15.0), by_depth(16.0), config), fuse(by_box(40.0), by_depth(42.0), config)
     assert near.centre_m.tolist() == [16.0, 1.2]
@@ -291,7 +291,7 @@ def test_the_papers_rule_asks_the_depth() -> None:
 
 
 @given(st.floats(5.0, 50.0), st.floats(5.0, 50.0), st.floats(1e-3, 100.0), st.floats(1e-3, 100.0), st.floats(-0.9, 0.9))
-def test_the_combined_covariance_is_one(a_m: float, b_m: float, a_var: float, b_var: float, rho: float) -> None:
+def test_combined_covariance_is_valid(a_m: float, b_m: float, a_var: float, b_var: float, rho: float) -> None:
     cov = np.array([[a_var, rho * math.sqrt(a_var * 0.1)], [rho * math.sqrt(a_var * 0.1), 0.1]])
     both = fuse(Place(a_m, np.array([a_m, 0.0]), cov), by_depth(b_m, b_var), CONFIG)
     assert np.linalg.eigvalsh(both.cov).min() > 0.0
@@ -300,7 +300,7 @@ def test_the_combined_covariance_is_one(a_m: float, b_m: float, a_var: float, b_
     assert np.isfinite(both.centre_m).all()
 
 
-def test_it_agrees_with_the_place_that_the_box_alone_gives_at_the_same_depth_and_yaw() -> None:
+def test_depth_and_box_agree_at_equal_depth_and_yaw() -> None:
     """The same edges, so the same bearing: only where along it differs."""
     pose = SE2(15.0, -3.0, 0.5)
     depth, boxes = scene([pose], (188, 621))

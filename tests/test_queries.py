@@ -1,4 +1,4 @@
-"""Queries of the bus: retained messages, the planner's queries, and no reply reported as none."""
+"""Queries of the bus: retained messages, planners' queries, and missing replies."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def at(number: int, x_m: float, y_m: float = 0.0) -> Any:
     )
 
 
-def test_the_last_messages_are_kept_for_those_that_come_late(join: Any) -> None:
+def test_last_messages_are_retained(join: Any) -> None:
     join("supervisor", hub=True)
     perceive = join("perceive")
     out = perceive.publisher("measurements")
@@ -55,7 +55,7 @@ def test_the_last_messages_are_kept_for_those_that_come_late(join: Any) -> None:
     assert optimize.retained("estimate", timeout_s=0.2) == []  # nobody sends them
 
 
-def test_a_planner_that_comes_late_has_the_last_estimate(join: Any, base: Path) -> None:
+def test_late_planner_gets_the_last_estimate(join: Any, base: Path) -> None:
     join("supervisor", hub=True)
     optimize = join("optimize")
     out = optimize.publisher("estimate")
@@ -75,7 +75,7 @@ def test_a_planner_that_comes_late_has_the_last_estimate(join: Any, base: Path) 
         assert planner.health("capture", timeout_s=0.2) is None
 
 
-def test_what_planners_ask_for(join: Any, base: Path) -> None:
+def test_replies_to_planner_queries(join: Any, base: Path) -> None:
     server = QueryServer(CONFIGURATION, hub := join("supervisor", hub=True))
     with Planner("car", base) as planner:
         hub.declare_alive()
@@ -133,7 +133,7 @@ points = st.lists(st.tuples(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6)), max_siz
 
 
 @given(st.integers(0, 4500), st.integers(0, 2500), st.booleans())
-def test_a_map_is_whole_again(landmarks: int, lanes: int, named: bool) -> None:
+def test_map_is_reassembled(landmarks: int, lanes: int, named: bool) -> None:
     chart = MapSnapshot(
         epoch=1,
         frame_id=2,
@@ -147,7 +147,7 @@ def test_a_map_is_whole_again(landmarks: int, lanes: int, named: bool) -> None:
 
 
 @given(st.integers(0, 2000), st.lists(st.integers(0, 64), max_size=64))
-def test_a_trajectory_is_whole_again(ego: int, vehicles: list[int]) -> None:
+def test_trajectory_is_reassembled(ego: int, vehicles: list[int]) -> None:
     def poses(count: int) -> tuple[TimedPose, ...]:
         return tuple(TimedPose(k, k * 10**17 // 5000, SE2(k + 0.1, 0.2, 0.3)) for k in range(count))
 
@@ -163,7 +163,7 @@ def test_a_trajectory_is_whole_again(ego: int, vehicles: list[int]) -> None:
     assert encode_all(parts)
 
 
-def test_who_asks_for_everything_gets_nothing(join: Any, base: Path) -> None:
+def test_wildcard_queries_get_no_reply(join: Any, base: Path) -> None:
     server = QueryServer(Configuration(), hub := join("supervisor", hub=True))
     server.add(at(1, 0.0))
     hub.declare_alive()
@@ -206,7 +206,7 @@ def test_a_lost_part_of_a_reply_is_an_error(join: Any, base: Path) -> None:
         queryable.undeclare()
 
 
-def test_a_flood_of_queries_is_answered_in_part_and_harms_nothing(join: Any, base: Path) -> None:
+def test_flood_of_queries_does_no_harm(join: Any, base: Path) -> None:
     hub, may_answer = join("supervisor", hub=True), threading.Event()
     way = Trajectory(epoch=1, frame_id=2, t_source_ns=3)
 

@@ -1,4 +1,4 @@
-"""A recorded drive: whole, cut off anywhere, damaged, on a full disk, and its recorder killed during a drive."""
+"""A recorded drive: complete, truncated, damaged, on a full disk, and with a killed recorder."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def tape(tmp_path: Path) -> Tape:
     return tape
 
 
-def test_between_two_looks_of_the_detector_its_boxes_stay() -> None:
+def test_boxes_are_kept_between_detector_runs() -> None:
     seen = next(m for m in measured(40) if m.cv)
     later = replace(seen, cv=(), status=(Status.DETECTIONS_CARRIED,), ages={"detector": 1})
     long_after = replace(later, ages={"detector": 60})
@@ -99,7 +99,7 @@ def test_records_come_back_byte_for_byte(tape: Tape) -> None:
     assert recording.damaged == 0
 
 
-def test_a_recording_holds_all_that_a_replay_needs(tape: Tape, tmp_path: Path) -> None:
+def test_recording_has_everything_for_a_replay(tape: Tape, tmp_path: Path) -> None:
     recording = Recording(tape.path)
     assert msgspec.convert(recording.about.configuration, Configuration) == tape.configuration
     assert recording.camera == CAMERA
@@ -170,7 +170,7 @@ def test_every_message_for_people_fits_its_schema(tape: Tape) -> None:
     assert {"/tf", "/ego", "/scene", "/road", "/camera/boxes", "/camera/image", "/estimate", "/alive"} <= seen
 
 
-def test_cut_off_anywhere_it_is_read_up_to_there(tape: Tape) -> None:
+def test_truncated_recording_is_read_up_to_the_end(tape: Tape) -> None:
     whole = tape.path.read_bytes()
     with tape.path.open("rb") as file:
         summary = make_reader(file).get_summary()
@@ -210,7 +210,7 @@ def test_a_damaged_chunk_is_left_out_and_counted(tape: Tape) -> None:
 
 
 @pytest.mark.parametrize("data", [b"", b"no recording", bytes(100), b"\x89MCAP0\r\n", b"\x89MCAP0\r\n" + bytes(50)])
-def test_what_is_no_recording_is_named(tmp_path: Path, data: bytes) -> None:
+def test_non_recording_file_is_named(tmp_path: Path, data: bytes) -> None:
     path = tmp_path / "x.mcap"
     path.write_bytes(data)
     with pytest.raises(RecordingError, match=r"x\.mcap"):
@@ -246,7 +246,7 @@ def test_a_full_disk_ends_the_recording_with_its_last_whole_chunk(
     assert recording.damaged == 0
 
 
-def test_who_writes_does_not_wait_for_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_writer_does_not_wait_for_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A disk that hangs holds up nothing until the memory for what waits is full."""
     read, wrote = os.pipe()
     monkeypatch.setattr(appendonly.os, "fdatasync", lambda fd: os.read(read, 1))
@@ -258,7 +258,7 @@ def test_who_writes_does_not_wait_for_the_disk(tmp_path: Path, monkeypatch: pyte
     assert (tmp_path / "file").stat().st_size == 50_000
 
 
-def test_what_the_disk_has_not_taken_is_not_counted_as_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unwritten_data_is_not_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read, wrote = os.pipe()
     monkeypatch.setattr(appendonly.os, "fdatasync", lambda fd: os.read(read, 1))
     writer = RecordingWriter(tmp_path / "a.mcap", about(Configuration(), {}), None, 100.0)
@@ -329,9 +329,7 @@ def drive_on(planner: Planner, frames: int) -> set[int]:
 
 
 @pytest.mark.processes
-def test_kills_and_restarts_cost_no_bit_and_a_kill_of_everything_leaves_a_file_that_opens(
-    tmp_path_factory: pytest.TempPathFactory, drive: Path
-) -> None:
+def test_kills_and_restarts_lose_no_data(tmp_path_factory: pytest.TempPathFactory, drive: Path) -> None:
     place = tmp_path_factory.mktemp("k")
     file = place / "k.mcap"
     with (
@@ -377,7 +375,7 @@ def test_kills_and_restarts_cost_no_bit_and_a_kill_of_everything_leaves_a_file_t
         ),
     ],
 )
-def test_a_recorder_is_restarted_with_a_new_file_and_ends_where_the_disk_is_full(
+def test_recorder_restarts_with_a_new_file_until_the_disk_is_full(
     fault: Callable[[Run], None],
     cause: str,
     tmp_path_factory: pytest.TempPathFactory,
@@ -444,7 +442,7 @@ class Backlog:
         return self._waiting.popleft() if self._waiting else None
 
 
-def test_a_recorder_that_catches_up_shows_life_with_each_message(tmp_path: Path) -> None:
+def test_recorder_sends_a_heartbeat_per_message(tmp_path: Path) -> None:
     """Its watchdog leaves out the time without a core, not what it takes to write all that waited meanwhile."""
     configuration = Configuration(vehicle="late", camera=CAMERA)
     messages = [Message(FrameRef(**stamps(m)), Trace(), m.t_capture_ns) for m in measured(200)]

@@ -1,4 +1,4 @@
-"""A replay gives the recorded estimates bit for bit, after restarts of the nodes and of the recorder too."""
+"""A replay gives the recorded estimates bit for bit, also after restarts of nodes and recorder."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def verdict_of(tape: Tape) -> Verdict:
     return compare(Recording(tape.path))
 
 
-def test_a_drive_gives_its_estimates_and_its_map_again(tmp_path: Path) -> None:
+def test_replay_reproduces_estimates_and_map(tmp_path: Path) -> None:
     tape, frames = Tape(tmp_path), measured(80)
     for measurements in frames:
         tape.step(measurements)
@@ -52,7 +52,7 @@ def test_a_drive_gives_its_estimates_and_its_map_again(tmp_path: Path) -> None:
     assert any(estimate.vehicles for estimate in tape.estimates)
 
 
-def test_the_last_bit_counts_and_the_first_that_differs_is_named(tmp_path: Path) -> None:
+def test_first_difference_is_named_to_the_last_bit(tmp_path: Path) -> None:
     tape, frames = Tape(tmp_path), measured(30)
 
     def bend(estimate: Estimate) -> Estimate:
@@ -206,7 +206,7 @@ def test_a_restart_that_took_longer_than_perceive_keeps_measurements(tmp_path: P
     assert verdict.equal == len(tape.estimates)
 
 
-def test_a_new_world_without_a_restart_that_anybody_saw_is_a_difference(tmp_path: Path) -> None:
+def test_new_epoch_without_restart_is_a_difference(tmp_path: Path) -> None:
     tape, frames = Tape(tmp_path), measured(20)
     for measurements in frames[:10]:
         tape.step(measurements)
@@ -239,9 +239,7 @@ def test_measurements_that_the_recorder_never_had_end_the_comparison_until_a_new
 
 @pytest.mark.parametrize("missing", ["estimate", "measurements too"])
 @pytest.mark.parametrize("restart", [False, True])
-def test_a_new_epoch_whose_first_estimate_was_lost_is_no_difference(
-    tmp_path: Path, missing: str, restart: bool
-) -> None:
+def test_new_epoch_with_lost_first_estimate_is_not_a_difference(tmp_path: Path, missing: str, restart: bool) -> None:
     tape, frames = Tape(tmp_path), measured(40)
     for measurements in frames[:10]:
         tape.step(measurements)
@@ -313,7 +311,7 @@ EVENTS = ("well", "well", "well", "dropped", "estimate lost", "late", "restored"
 
 @settings(max_examples=25)
 @given(events=st.lists(st.sampled_from(EVENTS), min_size=5, max_size=18), seed=st.integers(0, 3))
-def test_whatever_happens_nothing_differs(events: list[str], seed: int) -> None:
+def test_random_restarts_give_no_difference(events: list[str], seed: int) -> None:
     frames = iter(measured(4 * len(events) + 2, seed))
     with tempfile.TemporaryDirectory() as place:
         tape = Tape(Path(place))
@@ -386,7 +384,7 @@ def test_a_file_that_begins_in_the_middle_of_a_drive_replays_from_its_checkpoint
     assert verdict.restarts == 1
 
 
-def test_a_recording_that_was_cut_off_replays_up_to_there(tmp_path: Path) -> None:
+def test_truncated_recording_replays_up_to_its_end(tmp_path: Path) -> None:
     tape, frames = Tape(tmp_path), measured(40)
     for measurements in frames:
         tape.step(measurements)

@@ -127,7 +127,7 @@ def test_the_drive_is_read_back_in_one_plane(results: Path) -> None:
     assert len(drive.lanes_m) == FRAMES
 
 
-def test_the_band_of_the_speed_is_not_drawn_across_what_is_not_valid(results: Path) -> None:
+def test_speed_band_has_gaps_at_invalid_frames(results: Path) -> None:
     drive = read_drive(results)
     half = len(drive.t_s) // 2
     valid = np.ones(len(drive.t_s), bool)

@@ -1,4 +1,4 @@
-"""Restarts: when, how often, and what a new process takes over from the one before it."""
+"""Restarts: when, how often, and the state that a new process takes over."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def vitals() -> Vitals:
     return Vitals()
 
 
-def test_at_once_then_later_then_no_more(vitals: Vitals) -> None:
+def test_restart_delay_grows_to_a_limit(vitals: Vitals) -> None:
     restarts = Restarts(CONFIG)
     due_s = [restarts.died(100.0 + number, "killed", vitals) for number in range(4)]
     assert due_s == [100.0, 101.1, pytest.approx(102.15), None]
@@ -40,7 +40,7 @@ def test_at_once_then_later_then_no_more(vitals: Vitals) -> None:
     assert restarts.assignment().restarts == 3
 
 
-def test_what_lies_behind_the_window_is_forgiven(vitals: Vitals) -> None:
+def test_old_restarts_do_not_count(vitals: Vitals) -> None:
     restarts = Restarts(CONFIG)
     for number in range(20):
         assert restarts.died(11.0 * number, "killed", vitals) == 11.0 * number
@@ -63,7 +63,7 @@ def test_a_restarted_node_resumes_after_the_last_frame(vitals: Vitals) -> None:
     ("rate", "restart", "restarts"),
     [(None, None, True), (33.0, None, True), ("max", None, False), (None, "never", False), ("max", "always", True)],
 )
-def test_a_run_that_may_lose_no_frame_is_not_mended(rate: object, restart: object, restarts: bool) -> None:
+def test_lossless_run_is_not_restarted(rate: object, restart: object, restarts: bool) -> None:
     configuration = Configuration(
         source=SourceConfig(rate=rate),  # type: ignore[arg-type]
         runtime=RuntimeConfig(restart=restart),  # type: ignore[arg-type]
@@ -71,7 +71,7 @@ def test_a_run_that_may_lose_no_frame_is_not_mended(rate: object, restart: objec
     assert (configuration.restarts, configuration.spares) == (restarts, restarts)
 
 
-def test_epochs_grow_through_every_death(tmp_path: Path) -> None:
+def test_epoch_grows_with_every_restart(tmp_path: Path) -> None:
     path = tmp_path / "epoch"
     first = EpochFile(path)
     assert first.last == -1
@@ -83,7 +83,7 @@ def test_epochs_grow_through_every_death(tmp_path: Path) -> None:
 
 
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 1)), max_size=60))
-def test_a_node_that_takes_anything_in_is_left_alone(steps: list[tuple[int, int]]) -> None:
+def test_node_that_receives_is_not_restarted(steps: list[tuple[int, int]]) -> None:
     intake, sent, taken, since = Intake(), 0, 0, 0
     intake.missed(0, 0, 0.0, 0.0, 1.0)
     for second, (more, heard) in enumerate(steps, start=1):
@@ -95,14 +95,14 @@ def test_a_node_that_takes_anything_in_is_left_alone(steps: list[tuple[int, int]
         assert bool(missed) <= (sent - since >= MAX_MISSED_RECORDS)
 
 
-def test_silence_is_no_missed_record() -> None:
+def test_silence_is_not_a_missed_record() -> None:
     intake = Intake()
     assert not any(intake.missed(5, 5, 0.1, float(second), 1.0) for second in range(100))
     assert intake.missed(5 + MAX_MISSED_RECORDS, 5, 0.1, 100.0, 1.0) == MAX_MISSED_RECORDS
     assert intake.missed(2, 5, 0.1, 101.0, 1.0) == 0  # the sender restarted
 
 
-def test_a_loop_that_stands_still_misses_nothing_yet() -> None:
+def test_stalled_loop_misses_nothing_before_the_limit() -> None:
     intake = Intake()
     intake.missed(0, 7, 0.0, 0.0, 1.5)  # it took its last record, and went on beating for a moment
     told = [intake.missed(10 * k, 7, 0.1 * k - 0.2, 0.1 * k, 1.5) for k in range(3, 17)]
@@ -110,7 +110,7 @@ def test_a_loop_that_stands_still_misses_nothing_yet() -> None:
     assert intake.missed(170, 7, 0.05, 1.7, 1.5) == 170  # it only was slow, and has beaten since
 
 
-def test_a_loop_that_waits_for_a_core_is_not_silent() -> None:
+def test_loop_waiting_for_a_core_is_not_silent() -> None:
     silence = Silence()
     assert silence.own_s(1, 0.0, {7: 5.0}) == 0.0  # it waited before, and has beaten since
     assert silence.own_s(1, 40.0, {7: 44.0}) == 1.0  # all others went first
@@ -127,7 +127,7 @@ def test_a_loop_whose_lock_is_held_by_a_thread_that_waits_for_a_core_is_not_sile
     assert silence.own_s(1, 3.0, {7: 6.1, 8: 2.9, 9: 50.0}) == pytest.approx(1.1)  # a new thread has waited for nothing
 
 
-def test_a_loop_that_beat_right_after_the_last_look_is_not_silent_for_a_late_one() -> None:
+def test_late_check_does_not_count_as_silence() -> None:
     """At load 13 who looks waits for a core as well."""
     silence = Silence()
     silence.own_s(1, 0.0, {7: 5.0})
@@ -135,7 +135,7 @@ def test_a_loop_that_beat_right_after_the_last_look_is_not_silent_for_a_late_one
 
 
 @pytest.mark.processes
-def test_linux_says_how_long_a_process_waited_for_a_core() -> None:
+def test_waiting_time_for_a_core_is_read_from_linux() -> None:
     spin = "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\nwhile True: pass"
 
     def waited(process: subprocess.Popen[bytes]) -> float:
@@ -180,7 +180,7 @@ def test_systemd_is_notified(systemd: socket.socket, monkeypatch: pytest.MonkeyP
     assert said == ["READY=1", "WATCHDOG=1\nSTATUS=frame 7", "WATCHDOG=1\nSTATUS=frame 9", "STOPPING=1"]
 
 
-def test_without_systemd_nothing_is_said() -> None:
+def test_without_systemd_nothing_is_sent() -> None:
     notifier = Notifier({})
     assert notifier.period_s is None
     notifier.once("READY=1")

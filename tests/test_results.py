@@ -53,7 +53,7 @@ def vehicle(number: int, pose: SE2, frames: int, speed_mps: float = 0.0, **field
     )
 
 
-def test_the_counts_of_a_drive_are_there_though_the_disk_fails_what_is_made_of_its_files(tmp_path: Path) -> None:
+def test_counts_are_reported_despite_a_disk_failure(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path, CAMERA)
     recorder.add(estimate(0, SE2()))
     write_places(tmp_path, [Place(0, 0, SE2(), SE2())])
@@ -102,7 +102,7 @@ def test_a_drive(tmp_path: Path) -> None:
     assert summary["path"] == "x"
 
 
-def test_what_the_metres_rest_on_is_counted(tmp_path: Path) -> None:
+def test_scale_sources_are_counted(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path, CAMERA)
     road, car, carried = SpeedSource.ROAD, SpeedSource.CAR, SpeedSource.CARRIED
     for k, sources in enumerate([(), (road,), (road, car), (road, car), (carried,)]):
@@ -112,7 +112,7 @@ def test_what_the_metres_rest_on_is_counted(tmp_path: Path) -> None:
     assert summary["speed_sources"] == {"car": 2, "carried": 1, "road": 3}
 
 
-def test_a_changed_class_or_size_is_said_once(tmp_path: Path) -> None:
+def test_changed_class_or_size_is_written_once(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path, CAMERA)
     for k, (label, length_m) in enumerate([("car", 4.0), ("car", 4.01), ("van", 4.9), ("van", 4.9)]):
         recorder.add(
@@ -142,7 +142,7 @@ def test_row_k_is_frame_k_whatever_was_dropped_or_unreadable(tmp_path: Path) -> 
     assert summary["invalid_frames"] == 1
 
 
-def test_a_source_that_counts_anew_goes_on(tmp_path: Path) -> None:
+def test_restarted_frame_numbers_continue(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path, CAMERA)
     for frame_id in (0, 1, 0, 1, 2, 10**15):
         recorder.add(estimate(frame_id, SE2()))
@@ -240,7 +240,7 @@ def test_memory_of_a_long_drive_is_bounded(tmp_path: Path) -> None:
     assert len(list((tmp_path / "tracks").iterdir())) == 1500
 
 
-def test_the_picture_shows_the_way_and_the_moving_car(tmp_path: Path) -> None:
+def test_picture_shows_trajectory_and_moving_car(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path, CAMERA)
     for k in range(40):
         seen = (
@@ -259,7 +259,7 @@ def test_the_picture_shows_the_way_and_the_moving_car(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("moves", list(Moves))
-def test_only_a_vehicle_that_is_told_to_drive_is_drawn_so(moves: Moves) -> None:
+def test_only_moving_vehicles_are_drawn_as_moving(moves: Moves) -> None:
     recorder = SceneRecorder()
     for k in range(30):
         seen = (vehicle(1, SE2(15.0 + k, 3.5, 0.0), k + 1, 10.0, moves=moves),)

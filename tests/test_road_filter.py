@@ -1,4 +1,4 @@
-"""The road that bends: what a comparison of two images sees of it, and how the filter carries it on."""
+"""The road filter with vertical curvature: information of image comparisons, and propagation."""
 
 from __future__ import annotations
 
@@ -42,9 +42,7 @@ def compared(rear_m: float, ahead_rad: float) -> RoadFit:
 @pytest.mark.parametrize(
     ("rears_m", "curvature_per_m"), [((28.0, 30.0), GRADE / CURVE_M), ((105.0, 110.0, 115.0, 120.0), -GRADE / CURVE_M)]
 )
-def test_a_sag_and_a_crest_are_told_apart_by_the_image_of_the_road(
-    rears_m: tuple[float, ...], curvature_per_m: float
-) -> None:
+def test_image_comparison_distinguishes_sag_and_crest(rears_m: tuple[float, ...], curvature_per_m: float) -> None:
     """One pair of images knows it to half of itself at best."""
     seen = [float(compared(rear_m, 7.5 * curvature_per_m).state[3]) for rear_m in rears_m]
     assert 0.5 < np.mean(seen) / curvature_per_m < 2.0
@@ -61,7 +59,7 @@ def test_the_plane_under_the_camera_turns_with_the_road() -> None:
 
 
 @pytest.mark.parametrize("curvature_per_m", [0.001, -0.001])
-def test_a_crest_and_a_sag_are_learned_from_the_cars_own_pitching(curvature_per_m: float) -> None:
+def test_ego_pitch_determines_crest_and_sag(curvature_per_m: float) -> None:
     """No image of the road at all: a car that pitches on and on follows a road that bends."""
     filter_ = RoadFilter(CAMERA, RoadScaleConfig())
     for _ in range(40):
@@ -70,7 +68,7 @@ def test_a_crest_and_a_sag_are_learned_from_the_cars_own_pitching(curvature_per_
     assert abs(filter_.tilt[0]) < math.radians(0.6)
 
 
-def test_the_mount_is_not_what_the_filter_told_itself() -> None:
+def test_filter_does_not_reuse_its_own_output_as_mount() -> None:
     """Comparisons that see nothing of the tilt leave it, and its sigma, where the calibration put it."""
     filter_, config = RoadFilter(CAMERA, RoadScaleConfig()), RoadScaleConfig()
     blind = RoadFit(np.array([0.0, 0.3, 0.3, 0.0]), np.diag([1e-4, 1e4, 1e4, 1e4]), 0.9, 1000)
@@ -81,7 +79,7 @@ def test_the_mount_is_not_what_the_filter_told_itself() -> None:
     assert filter_.cov[4, 4] >= config.sigma_mount_rad**2
 
 
-def test_corners_that_err_alike_for_metres_do_not_make_a_tilt_sure() -> None:
+def test_correlated_feature_errors_keep_the_tilt_uncertain() -> None:
     """The same landmarks show a direction that is 20 mrad off, and know it to 20 mm: no more than that is learned."""
     filters = {sigma_m: RoadFilter(CAMERA, RoadScaleConfig()) for sigma_m in (0.0, 0.02)}
     wrong = np.array([0.0, -0.02, 1.0])
@@ -102,7 +100,7 @@ def _of_the_length(sigma_log: float) -> RoadFit:
     return RoadFit(np.zeros(4), np.diag([sigma_log**2, 1e-6, 1e-6, 1e-8]), 0.9, 1000)
 
 
-def test_an_alignment_that_tells_little_of_the_length_takes_back_little_of_what_is_carried() -> None:
+def test_weak_alignment_hardly_changes_a_carried_scale() -> None:
     config = RoadScaleConfig()
     left = []
     for sigma_log in (0.03, 0.15, 0.5, 1.0):
@@ -118,7 +116,7 @@ def test_an_alignment_that_tells_little_of_the_length_takes_back_little_of_what_
     assert left[3] > 0.95
 
 
-def test_many_vague_alignments_tell_what_they_hold_together_and_no_more() -> None:
+def test_weak_alignments_add_up_consistently() -> None:
     filter_ = RoadFilter(CAMERA, RoadScaleConfig())
     for _ in range(20):
         filter_.predict(np.eye(3), 1.0)
@@ -127,7 +125,7 @@ def test_many_vague_alignments_tell_what_they_hold_together_and_no_more() -> Non
     assert math.sqrt(filter_.cov[0, 0]) > 0.12  # 0.6 over the root of 20
 
 
-def test_a_tilt_that_is_not_known_hides_the_length() -> None:
+def test_unknown_tilt_hides_the_scale() -> None:
     """The same alignment, of a steep trade of length against pitch: it tells the length where the pitch is known."""
     steep = np.array([1.0, 0.1, 0.0, 0.0])  # a tenth of a radian of pitch for all of the length
     fit = RoadFit(np.zeros(4), np.diag([1e-4, 1e-6, 1e-6, 1e-8]) + np.outer(steep, steep), 0.9, 1000)
@@ -136,7 +134,7 @@ def test_a_tilt_that_is_not_known_hides_the_length() -> None:
     assert unsure.information(fit) < 0.7 * sure.information(fit)
 
 
-def test_a_carried_scale_is_known_the_worse_the_longer_it_is_carried() -> None:
+def test_sigma_of_carried_scale_grows() -> None:
     """Its errors go together: twice the way is more than the root of two of the sigma."""
     sigma_rel = []
     for metres in (100, 200):
@@ -165,7 +163,7 @@ def pitch_under_drift(config: RoadScaleConfig) -> float:
     return abs(float(filter_.tilt[0]))
 
 
-def test_a_drift_of_the_unit_does_not_tilt_the_road() -> None:
+def test_scale_drift_does_not_tilt_the_road() -> None:
     """Where only lengths walk, the trade of length against pitch gives most of a drift to the pitch."""
     without = pitch_under_drift(RoadScaleConfig(scale_drift_per_m=1e-9))
     assert without > 0.004
@@ -173,7 +171,7 @@ def test_a_drift_of_the_unit_does_not_tilt_the_road() -> None:
 
 
 @pytest.mark.parametrize(("agreed", "needed"), [(1, 1), (5, 5), (40, 10)])
-def test_another_length_must_outweigh_those_that_agreed_on_the_one_before(agreed: int, needed: int) -> None:
+def test_new_scale_must_outweigh_earlier_agreement(agreed: int, needed: int) -> None:
     confirmation = ScaleConfirmation(RoadScaleConfig())
     for _ in range(agreed):
         confirmation.confirm(1.0, 0.01)
@@ -186,7 +184,7 @@ def test_another_length_must_outweigh_those_that_agreed_on_the_one_before(agreed
     assert count == needed
 
 
-def test_a_weak_comparison_counts_where_two_before_found_the_same_length() -> None:
+def test_weak_comparison_counts_with_two_agreeing_ones() -> None:
     confirmation = ScaleConfirmation(RoadScaleConfig())
     confirmation.reject(1.0, 3.4)
     confirmation.reject(1.0)
@@ -199,7 +197,7 @@ def test_a_weak_comparison_counts_where_two_before_found_the_same_length() -> No
     assert not confirmation.was_found_before(3.45)
 
 
-def test_a_known_length_gives_way_to_another_that_two_searches_found_before() -> None:
+def test_known_scale_yields_to_two_agreeing_searches() -> None:
     """The town film at half size from its 13th second on grew by 30 % at one comparison that correlated by .33."""
     confirmation = ScaleConfirmation(RoadScaleConfig())
     assert confirmation.is_plausible(0.3)  # nothing is known

@@ -1,4 +1,4 @@
-"""What a comparison of the road says for itself: slopes that are noise neither pull it nor make it sure."""
+"""The road comparison's covariance: noise in the gradients neither biases nor sharpens it."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def fitted(seed: int, noise: NDArray[np.float64], sigma: float = 0.2) -> tuple[F
 
 @given(seed=st.integers(0, 500))
 @settings(max_examples=30, deadline=None)
-def test_slopes_that_both_images_have_give_the_least_squares(seed: int) -> None:
+def test_common_gradients_give_least_squares(seed: int) -> None:
     px, past, _, residual = images(np.random.default_rng(seed), np.zeros(N), 0.2)
     state, cov = fit_without_prior(
         np.zeros(ROAD + MOTION), px, past, past, residual, np.full(N, 25.0), np.eye(MOTION) * 1e8
@@ -62,7 +62,7 @@ def test_slopes_that_both_images_have_give_the_least_squares(seed: int) -> None:
     np.testing.assert_allclose(cov, 0.04 * np.linalg.inv(J.T @ J)[:ROAD, :ROAD], atol=0.1 * sigma.max() ** 2)
 
 
-def test_noise_in_the_slopes_does_not_pull_the_length_towards_the_guess() -> None:
+def test_gradient_noise_does_not_bias_towards_the_guess() -> None:
     """Least squares by noisy slopes finds half of it; with as many noisy pixels as good ones nothing is lost."""
     everywhere = np.array([fitted(seed, np.ones(N))[0] for seed in range(30)])
     assert np.mean(everywhere[:, 0]) == pytest.approx(TRUE[0], rel=0.1)
@@ -72,7 +72,7 @@ def test_noise_in_the_slopes_does_not_pull_the_length_towards_the_guess() -> Non
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.5, 1.0])
-def test_a_fit_errs_by_as_much_as_it_says(noise: float) -> None:
+def test_fit_is_consistent_with_its_sigma(noise: float) -> None:
     """Its error over its sigma, squared, in the mean over drives; the slopes' own noise makes the residual's larger."""
     ratios = []
     for seed in range(60):
@@ -81,7 +81,7 @@ def test_a_fit_errs_by_as_much_as_it_says(noise: float) -> None:
     assert 0.4 < np.mean(ratios) < 2.0
 
 
-def test_grain_that_only_one_image_has_says_nothing() -> None:
+def test_texture_in_only_one_image_has_no_weight() -> None:
     rng = np.random.default_rng(1)
     px, past, _, residual = images(rng, np.zeros(N), 0.2)
     _, other, _, _ = images(rng, np.zeros(N), 0.2)
@@ -95,7 +95,7 @@ def test_grain_that_only_one_image_has_says_nothing() -> None:
     assert (np.diag(vague) > 9.0 * np.diag(sure)).all()
 
 
-def test_what_is_painted_counts_beside_grain_that_was_left_out() -> None:
+def test_paint_counts_without_texture() -> None:
     """Pixels on the left have slopes that both images share, those on the right have noise alone."""
     px, past, present, _ = images(np.random.default_rng(2), np.zeros(N), 0.2)
     right = px[:, 0] >= 320

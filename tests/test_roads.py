@@ -99,12 +99,12 @@ def told_obstructed(drive: Drive) -> list[bool]:
 
 
 @pytest.mark.parametrize("name", first(1, ["motorway_40", "ramp_20", "ramp_21_glare"]))
-def test_lines_along_the_way_are_not_told_as_something_on_the_glass(name: str) -> None:
+def test_lines_along_the_road_are_not_obstructions(name: str) -> None:
     assert not any(told_obstructed(read(DemoRecording(directory=CLIPS / name))))
 
 
 @pytest.mark.parametrize("effect", first(1, ["drops", "dirt", "reflection"]))
-def test_what_is_on_the_glass_of_a_motorway_is_told(effect: str) -> None:
+def test_obstructions_on_a_motorway_are_reported(effect: str) -> None:
     told = told_obstructed(read(DemoRecording(directory=CLIPS / "motorway_20"), EFFECTS[effect]()))
     assert sum(told) >= 0.3 * len(told)
 
@@ -112,7 +112,7 @@ def test_what_is_on_the_glass_of_a_motorway_is_told(effect: str) -> None:
 # --- how much a comparison of the road is believed ---
 
 
-def test_a_comparison_errs_by_as_much_as_it_says() -> None:
+def test_road_comparison_is_consistent_with_its_sigma() -> None:
     """Of a motion that is disturbed at random the length is measured; its error over its sigma is 1 in the mean."""
     drive = read(DemoRecording(stride=TOWN_STRIDE, directory=DIRECTORY), None, 24)
     camera, rng, squares = drive.camera, np.random.default_rng(1), []
@@ -144,7 +144,7 @@ def images() -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_an_overlay_stands_still_and_is_drawn_the_same_each_time(kind: str, images: list[np.ndarray]) -> None:
+def test_overlay_is_fixed_and_deterministic(kind: str, images: list[np.ndarray]) -> None:
     height, width = images[0].shape[:2]
     first, again = (Overlay(kind, width, height, seed=1) for _ in range(2))
     changed = []
@@ -161,7 +161,7 @@ def test_an_overlay_stands_still_and_is_drawn_the_same_each_time(kind: str, imag
         assert first.draw(grey).shape == grey.shape
 
 
-def test_a_bonnet_covers_the_lower_edge_alone(images: list[np.ndarray]) -> None:
+def test_bonnet_covers_only_the_lower_edge(images: list[np.ndarray]) -> None:
     image = images[0]
     for one in (image, cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)):
         drawn = bonnet(one)
@@ -171,9 +171,7 @@ def test_a_bonnet_covers_the_lower_edge_alone(images: list[np.ndarray]) -> None:
 
 
 @pytest.mark.parametrize("size", [(640, 192), (621, 187)])
-def test_compression_loses_what_is_faint_and_keeps_what_is_strong(
-    images: list[np.ndarray], size: tuple[int, int]
-) -> None:
+def test_compression_removes_weak_texture(images: list[np.ndarray], size: tuple[int, int]) -> None:
     sized = [cv2.resize(image, size) for image in images]
     coarse, fine = VideoEncoder(step=40.0), VideoEncoder(step=2.0)
     errors = []
@@ -186,7 +184,7 @@ def test_compression_loses_what_is_faint_and_keeps_what_is_strong(
     assert (np.array(errors)[:, 1] < 0.5 * np.array(errors)[:, 0]).all()
 
 
-def test_a_flat_road_stands_still_behind_an_encoder() -> None:
+def test_smooth_road_freezes_under_compression() -> None:
     """What moves too faintly to be coded stays where it was: the encoder's worst for an odometry."""
     rng = np.random.default_rng(2)
     grain = cv2.GaussianBlur(rng.normal(0.0, 8.0, (64, 256)), (0, 0), 1.5)
@@ -201,7 +199,7 @@ def test_a_flat_road_stands_still_behind_an_encoder() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-def test_a_clip_is_what_its_seed_renders(name: str, tmp_path: Path) -> None:
+def test_clip_is_determined_by_its_seed(name: str, tmp_path: Path) -> None:
     """The truth to the bit; the images but for what another processor or another WebP rounds."""
     if importlib.util.find_spec("numba") is None:
         pytest.skip("the built-in world is rendered with numba (extra `train`)")

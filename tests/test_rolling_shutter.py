@@ -1,4 +1,4 @@
-"""Rows that are read in turn: undone in corners and in comparisons of the road, and estimated from a drive."""
+"""Rolling shutter: compensated in features and road comparisons, and estimated from a drive."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ NO_BOXES = np.zeros((0, 4))
 SPEED_MPS = 20.0
 
 
-def test_a_point_is_where_it_was_when_the_middle_row_was_read() -> None:
+def test_points_are_moved_to_the_time_of_the_middle_row() -> None:
     """A camera that drives straight on and turns; points at known places, seen by each of its rows in turn."""
     rng = np.random.default_rng(0)
     places = np.column_stack([rng.uniform(-5, 5, 50), rng.uniform(-2, 1.3, 50), rng.uniform(6, 40, 50)])
@@ -45,7 +45,7 @@ def test_a_point_is_where_it_was_when_the_middle_row_was_read() -> None:
 
 
 @pytest.mark.parametrize("fisheye", [False, True])
-def test_a_row_is_that_of_the_sensor_not_of_the_undistorted_image(fisheye: bool) -> None:
+def test_rows_are_those_of_the_raw_image(fisheye: bool) -> None:
     lens = (-0.05, 0.0, 0.0, 0.0) if fisheye else (-0.25, 0.05, 0.0, 0.0)
     camera = msgspec.structs.replace(CAMERA, distortion=lens, fisheye=fisheye)
     u, v = np.array([40.0, 319.5, 600.0, 320.0]), np.array([340.0, 179.5, 20.0, 350.0])
@@ -75,7 +75,7 @@ def road_read_in_turn(way_m: float, readout_s: float) -> np.ndarray:
     return np.clip(grey, 0, 255).astype(np.uint8)
 
 
-def test_a_comparison_of_the_road_knows_that_near_rows_are_read_later() -> None:
+def test_road_comparison_includes_readout_time() -> None:
     """At 20 m/s and 25 Hz, 30 ms make the road's motion some 3 % too long."""
     at_once, plain, in_turn = (
         compared(readout_s, share) for readout_s, share in ((0.0, 0.0), (0.03, 0.0), (0.03, 0.75))
@@ -123,7 +123,7 @@ def corners(readout_s: float, images: int, seed: int, rate_hz: float = 20.0) -> 
 
 
 @pytest.mark.parametrize("readout_s", [0.0, 0.02])
-def test_a_drive_shows_how_long_its_camera_reads(readout_s: float) -> None:
+def test_drive_determines_readout_time(readout_s: float) -> None:
     found = readout_of_drive(corners(readout_s, 40, 1), CAMERA)
     assert found.by_drive is not None
     by_drive, sigma_s = found.by_drive
@@ -132,13 +132,13 @@ def test_a_drive_shows_how_long_its_camera_reads(readout_s: float) -> None:
     assert found.sigma_s < min(sigma_s, PRIOR.sigma_s)
 
 
-def test_what_is_usual_holds_where_the_drive_shows_nothing() -> None:
+def test_prior_readout_time_holds_without_information() -> None:
     standing = [CornersOfImage(each.ids, each.px, 0.05 * k) for k, each in enumerate(corners(0.02, 1, 1) * 30)]
     assert readout_of_drive(standing, CAMERA) == PRIOR
     assert readout_of_drive([], CAMERA) == PRIOR
 
 
-def test_a_camera_file_states_it(tmp_path: Path) -> None:
+def test_camera_file_states_readout_time(tmp_path: Path) -> None:
     path = tmp_path / "camera.toml"
     path.write_text(camera_text(CAMERA, ()))
     assert load_camera(path) == CAMERA
@@ -147,7 +147,7 @@ def test_a_camera_file_states_it(tmp_path: Path) -> None:
         load_camera(path)
 
 
-def test_a_turn_that_changes_while_rows_are_read_is_known_the_less() -> None:
+def test_changing_turn_rate_grows_the_sigma() -> None:
     """A firm mount's sigma is as it was; one that swings by half a degree at 10 Hz turns otherwise in each image."""
     cov6 = np.diag([1e-4] * 3 + [1e-7] * 3)
     swings_radps = np.array([0.5, 0.0, 0.2])

@@ -110,7 +110,7 @@ IN_ODOM = [
 ]
 
 
-def test_the_ego_is_where_it_was(sent: dict[str, list[Any]]) -> None:
+def test_ego_pose_is_exported(sent: dict[str, list[Any]]) -> None:
     for frame, (message, transform, pose) in enumerate(
         zip(sent["/birdslam/odometry"], sent["/tf"], IN_ODOM, strict=True)
     ):
@@ -127,7 +127,7 @@ def test_the_ego_is_where_it_was(sent: dict[str, list[Any]]) -> None:
     assert path.header.frame_id == "odom"
 
 
-def test_covariances_are_in_the_axes_of_ros(sent: dict[str, list[Any]]) -> None:
+def test_covariances_are_in_ros_axes(sent: dict[str, list[Any]]) -> None:
     cov = sent["/birdslam/odometry"][1].pose.covariance.reshape(6, 6)
     c, s = math.cos(0.4), math.sin(0.4)
     R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
@@ -239,7 +239,7 @@ def test_a_live_drive_has_utc(tmp_path: Path) -> None:
         assert next(bag.messages("/birdslam/odometry")).t_ns == FIRST_NS + 5
 
 
-def test_what_can_not_be_exported_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_export_errors_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     drive = str(recording(tmp_path / "d.mcap"))
     (tmp_path / "there").mkdir()
     for arguments, said in (
@@ -254,7 +254,7 @@ def test_what_can_not_be_exported_is_named(tmp_path: Path, capsys: pytest.Captur
     assert not list(tmp_path.glob(".*"))
 
 
-def test_a_bag_that_fails_leaves_nothing(tmp_path: Path) -> None:
+def test_failed_bag_leaves_nothing(tmp_path: Path) -> None:
     def fail() -> None:
         with BagWriter(tmp_path / "bag") as bag:
             bag.write("/a", bag.make("std_msgs/msg/String"), 3)

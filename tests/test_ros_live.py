@@ -231,7 +231,7 @@ def test_lines_and_the_ego_lane() -> None:
 
 
 @given(st.text("abz09_/*$#?% .é-", max_size=30))
-def test_a_name_reaches_no_key_but_its_own(name: str) -> None:
+def test_name_matches_only_its_own_key(name: str) -> None:
     """Whatever somebody calls a topic or a namespace: it is refused, or the key is one plain key."""
     for checked in (lambda: topic_key(0, name, "std_msgs/msg/String", NO_HASH), lambda: check_namespace(name)):
         try:
@@ -244,7 +244,7 @@ def test_a_name_reaches_no_key_but_its_own(name: str) -> None:
 
 
 @given(st.text("@ros2_lv/%MP*:_aA0", max_size=60), st.binary(max_size=80))
-def test_what_others_send_is_read_or_refused(token: str, data: bytes) -> None:
+def test_foreign_messages_are_read_or_refused(token: str, data: bytes) -> None:
     assert publication_of(token) is None or token.count("/") == 12
     type_of_key(token)
     types = MessageTypes()
@@ -266,7 +266,7 @@ def test_times_of_the_same_clock_are_exact_and_those_of_another_keep_their_inter
     assert late[-1] == 2 * 10**9 + (500 + CLOCK_FRAMES) * period  # the sender's clock was set: after some frames
 
 
-def test_what_can_not_be_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any) -> None:
+def test_invalid_settings_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any) -> None:
     for arguments, said in (
         (["ros", "--namespace", "/a b"], "ros.namespace: '/a b' is not a ROS topic"),
         (["ros", "--router", "nowhere"], "ros.router"),
@@ -365,7 +365,7 @@ def place(odometry: Any) -> float:
 
 
 @processes
-def test_a_listener_hears_each_message_and_again_after_the_router_was_gone(join: Any, base: Path) -> None:
+def test_subscriber_gets_all_messages_and_reconnects(join: Any, base: Path) -> None:
     port = free_port()
     with ExitStack() as stack:
         with pytest.raises(NoRouter, match=f"ros.router tcp/127.0.0.1:{port}: the router is not reachable"):
@@ -403,7 +403,7 @@ def test_a_listener_hears_each_message_and_again_after_the_router_was_gone(join:
 
 
 @processes
-def test_in_a_namespace_topics_and_frames_are_the_vehicles_own(join: Any, base: Path) -> None:
+def test_namespace_prefixes_topics_and_frames(join: Any, base: Path) -> None:
     port = free_port()
     with ExitStack() as stack:
         stack.enter_context(peer("router", str(port)))
@@ -428,7 +428,7 @@ def test_in_a_namespace_topics_and_frames_are_the_vehicles_own(join: Any, base: 
 
 
 @processes
-def test_a_rate_thins_estimates_and_places_in_the_map(join: Any, base: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rate_limit_thins_estimates_and_map_poses(join: Any, base: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     said: Counter[str] = Counter()
     monkeypatch.setattr(RosPublisher, "publish", lambda self, message: said.update([message.__msgtype__]))
     port, in_map = free_port(), TOPICS[MAP_POSE]
@@ -441,7 +441,7 @@ def test_a_rate_thins_estimates_and_places_in_the_map(join: Any, base: Path, mon
     assert (said[in_map], said[TOPICS["/birdslam/vehicles"]]) == (1, 2)  # boxes: of vehicles, and of people
 
 
-def test_a_rate_holds_in_the_mean_and_a_pause_is_not_made_up_for() -> None:
+def test_rate_limit_holds_in_the_mean_without_catching_up() -> None:
     limit, everything = RateLimit(10.0), RateLimit(None)
     times = [30_000_000 * k for k in range(100)] + [10**11 + 30_000_000 * k for k in range(100)]
     passed = [t for t in times if limit.passes(t)]
@@ -496,7 +496,7 @@ def test_images_of_a_topic_are_a_source_with_their_camera_speed_and_fixes(tmp_pa
     assert times[0] - 10**10 < fixes[0].t_source_ns < times[-1]
 
 
-def test_a_live_drive_comes_to_earth_by_the_fixes_that_came(tmp_path: Path) -> None:
+def test_live_drive_is_georeferenced_by_fixes(tmp_path: Path) -> None:
     live = msgspec.structs.replace(configuration(1, tmp_path), camera=CAMERA)
     drive = DriveMap.of(live)
     assert drive is not None
@@ -516,7 +516,7 @@ def test_a_live_drive_comes_to_earth_by_the_fixes_that_came(tmp_path: Path) -> N
 
 
 @processes
-def test_a_source_without_images_says_why(tmp_path: Path) -> None:
+def test_source_without_images_reports_the_reason(tmp_path: Path) -> None:
     port = free_port()
     asked = configuration(port, tmp_path)
     short = msgspec.structs.replace(asked, source=msgspec.structs.replace(asked.source, camera_timeout_s=0.5))
@@ -535,9 +535,7 @@ def test_a_source_without_images_says_why(tmp_path: Path) -> None:
 
 
 @processes
-def test_images_that_were_lost_on_their_way_are_counted_by_their_numbers(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_lost_images_are_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     port, types, over = free_port(), MessageTypes(), threading.Event()
     key = topic_key(0, "/front/image", "sensor_msgs/msg/Image", types.type_hash("sensor_msgs/msg/Image"))
 
@@ -572,7 +570,7 @@ def test_images_that_were_lost_on_their_way_are_counted_by_their_numbers(
 
 
 @processes
-def test_while_the_router_is_gone_frames_say_so_and_then_images_come_again(tmp_path: Path) -> None:
+def test_lost_router_is_reported_and_images_return(tmp_path: Path) -> None:
     port = free_port()
     with ExitStack() as stack:
         router = stack.enter_context(ExitStack())

@@ -1,4 +1,4 @@
-"""ROS bags in: every storage and encoding, the camera and its place, speeds, truth; what is torn or ambiguous."""
+"""ROS bags as sources: storages, encodings, camera and mount, speeds, truth; torn or ambiguous bags."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def bag(path: Path, *more: ros.Written, storage: str = "sqlite3") -> str:
 
 
 @pytest.mark.parametrize("storage", ["sqlite3", "mcap", "ros1"])
-def test_a_drive_comes_back_from_every_storage(tmp_path: Path, storage: str) -> None:
+def test_drive_is_read_from_every_storage(tmp_path: Path, storage: str) -> None:
     place = tmp_path / ("drive.bag" if storage == "ros1" else "drive")
     recording = open_recording(bag(place, storage=storage))
     assert (recording.name, len(recording), recording.rate_hz) == ("drive", 6, pytest.approx(10.0))
@@ -109,12 +109,12 @@ BGR = RNG.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
     ],
 )
 @given(padding=st.integers(0, 40))
-def test_each_encoding_gives_its_pixels(encoding: str, stored: np.ndarray, expected: np.ndarray, padding: int) -> None:
+def test_each_encoding_is_decoded(encoding: str, stored: np.ndarray, expected: np.ndarray, padding: int) -> None:
     assert np.array_equal(pixels(ros.image(stored, 0, encoding, padding)), expected)
 
 
 @pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
-def test_a_mosaic_of_one_colour_is_that_colour(pattern: str) -> None:
+def test_uniform_bayer_image_is_uniform(pattern: str) -> None:
     colour = {"r": 200, "g": 100, "b": 30}
     cell = np.array([colour[c] for c in pattern], np.uint8).reshape(2, 2)
     image = pixels(ros.image(np.tile(cell, (HEIGHT // 2, WIDTH // 2)), 0, f"bayer_{pattern}8"))
@@ -135,7 +135,7 @@ def test_yuv_without_colour_is_grey(encoding: str, luma: int) -> None:
     st.sampled_from(["mono8", "rgb8", "yuv422", "bayer_rggb8", "16UC1", "", "jpeg"]),
     st.integers(0, 40), st.integers(0, 40), st.integers(0, 200), st.binary(max_size=300),
 )  # fmt: skip
-def test_whatever_an_image_says_it_is_an_image_or_an_error(
+def test_any_image_message_is_an_image_or_an_error(
     encoding: str, height: int, width: int, step: int, data: bytes
 ) -> None:
     message = ros.image(GREYS[0], 0, encoding)
@@ -179,7 +179,7 @@ def test_camera_info(info: object, rectified: bool, expected: tuple[float, float
 
 
 @pytest.mark.parametrize("fisheye", [False, True])
-def test_a_distorted_image_comes_straight(fisheye: bool) -> None:
+def test_distorted_image_is_undistorted(fisheye: bool) -> None:
     """A grid of world points, seen through the lens, lies where the pinhole has it after undistortion."""
     coefficients = (0.05, -0.01, 0.002, -0.001) if fisheye else (-0.25, 0.08, 0.001, -0.002, 0.0)
     camera = Camera(640, 480, 300.0, 305.0, 322.0, 238.0, 1.5, distortion=coefficients, fisheye=fisheye)
@@ -217,7 +217,7 @@ def test_several_topics_are_listed_and_one_is_named(tmp_path: Path) -> None:
         open_recording(uri, topics=BagTopics(image=IMAGE, speed=info))
 
 
-def test_a_camera_without_a_known_place_needs_a_file(tmp_path: Path) -> None:
+def test_camera_without_mount_needs_a_file(tmp_path: Path) -> None:
     messages = [message for message in drive() if message[0] != "/tf_static"]
     path = ros.write_bag(tmp_path / "drive", messages)
     with pytest.raises(DatasetError, match=r"height of the camera above.*birdslam calibrate rosbag:.*--height M"):
@@ -230,7 +230,7 @@ def test_a_camera_without_a_known_place_needs_a_file(tmp_path: Path) -> None:
         open_recording(f"rosbag:{path}", wrong)
 
 
-def test_a_place_that_can_be_none_is_named(tmp_path: Path) -> None:
+def test_implausible_mount_is_named(tmp_path: Path) -> None:
     messages = [message for message in drive() if message[0] != "/tf_static"]
     frames = ros.tf(ros.transform("base_link", "camera_optical", (1.0, 0.0, 1.5), Rotation.identity()))
     path = ros.write_bag(tmp_path / "drive", [("/tf_static", FIRST_NS, frames), *messages])
@@ -245,7 +245,7 @@ def test_a_camera_without_calibration_is_named(tmp_path: Path) -> None:
         open_recording(f"rosbag:{path}")
 
 
-def test_an_image_out_of_order_is_unreadable_and_the_drive_goes_on(tmp_path: Path) -> None:
+def test_image_out_of_order_is_unreadable(tmp_path: Path) -> None:
     messages = drive()
     messages.insert(5, (IMAGE, messages[4][1] + 1, ros.image(GREYS[5], FIRST_NS)))
     frames = list(open_recording(f"rosbag:{ros.write_bag(tmp_path / 'drive', messages)}").frames())
@@ -352,7 +352,7 @@ def test_the_truth_of_a_satellites_fixes(tmp_path: Path) -> None:
     assert np.abs(ahead[:, 1:]).max() < 1e-3
 
 
-def test_east_north_up_against_the_arc() -> None:
+def test_east_north_up_agrees_with_the_arc() -> None:
     up = east_north_up([(50.0, 8.0, 100.0), (50.0001, 8.0, 100.0), (50.0, 8.0001, 130.0)])
     assert up[0].tolist() == [0.0, 0.0, 0.0]
     assert up[1] == pytest.approx([0.0, 11.1229, 0.0], abs=2e-3)  # a degree of the meridian at 50 N: 111 229 m
@@ -378,7 +378,7 @@ def test_a_bag_cut_off_anywhere_is_named_or_ends_with_an_unreadable_frame(
     assert str(path) in said
 
 
-def test_what_is_no_bag_is_named(tmp_path: Path) -> None:
+def test_non_bag_is_named(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="nowhere: no such file or directory"):
         open_recording(f"rosbag:{tmp_path / 'nowhere'}")
     (tmp_path / "drive.mcap").write_bytes(b"\x89MCAP0\r\n nothing")
@@ -412,7 +412,7 @@ def test_a_run_opens_it_with_its_topics(tmp_path: Path) -> None:
     st.lists(st.integers(20_000_000, 200_000_000), min_size=2, max_size=30),
     st.dictionaries(st.integers(1, 29), st.integers(-(10**18), 10**18), max_size=4),
 )
-def test_images_go_on_across_steps_of_their_clock(periods_ns: list[int], steps_ns: dict[int, int]) -> None:
+def test_clock_steps_do_not_stop_the_images(periods_ns: list[int], steps_ns: dict[int, int]) -> None:
     """Whatever the clock of the stamps does, the images keep their periods; small errors of both clocks stay."""
     clock, stamp_ns, recorded_ns, times = ImageClock(), 0, 10**18, []
     for k, period_ns in enumerate(periods_ns):
@@ -423,6 +423,6 @@ def test_images_go_on_across_steps_of_their_clock(periods_ns: list[int], steps_n
     assert np.diff(times).tolist() == periods_ns[1:]
 
 
-def test_a_pause_of_a_bag_stays() -> None:
+def test_pause_of_a_bag_is_kept() -> None:
     clock = ImageClock()
     assert [clock.time_ns(t, t + 7) for t in (0, 10**8, 300 * 10**9, 300 * 10**9 + 10**8)][2] == 300 * 10**9

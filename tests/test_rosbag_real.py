@@ -1,4 +1,4 @@
-"""A real drive as ROS bags: whatever the storage, the same estimates as from its files, byte for byte."""
+"""A real drive as ROS bags: the same estimates as from its files, bit for bit."""
 
 from __future__ import annotations
 
@@ -159,7 +159,7 @@ def test_a_real_bag_driven_recorded_and_exported_comes_back(tmp_path: Path, data
 
 
 @pytest.mark.slow
-def test_a_real_drive_is_held_to_the_truth_of_its_bag(tmp_path: Path, data_dir: Path) -> None:
+def test_real_drive_is_compared_with_the_truth_of_its_bag(tmp_path: Path, data_dir: Path) -> None:
     """nav_msgs/Odometry gives the ATE that KITTI's poses give; fixes, which have no attitude, that after alignment."""
     count = 60
     drive = KittiRecording(data_dir / "kitti_tracking" / "training" / "image_03" / "0005")

@@ -1,4 +1,4 @@
-"""Smoothed vehicles: sizes learned late correct earlier measurements, what stood stands still, what moved moves."""
+"""Smoothed vehicles: late sizes correct earlier positions, stationary and moving phases are kept."""
 
 from __future__ import annotations
 
@@ -83,14 +83,14 @@ def errors(log: list[Measurements]) -> dict[str, tuple[float, float]]:
 
 
 @pytest.mark.parametrize("parked_height_m", first(1, [1.38, 1.46, 1.68]))
-def test_a_parked_cars_trajectory_is_better_known_once_its_size_is(parked_height_m: float) -> None:
+def test_known_size_improves_the_trajectory_of_a_parked_car(parked_height_m: float) -> None:
     trials = [errors(log_of(seed, parked_height_m, 1.53)) for seed in range(2)]
     live, smoothed = np.mean([t["parked"] for t in trials], axis=0)
     assert smoothed < 0.6 * live
 
 
 @pytest.mark.slow  # many seeds
-def test_over_many_sizes_no_kind_of_motion_is_worse_when_smoothed() -> None:
+def test_smoothing_never_worsens_any_motion() -> None:
     heights = 1.53 * np.exp(CAR.sigma_height_rel * np.random.default_rng(0).standard_normal((5, 2)))
     trials = [errors(log_of(seed, *pair)) for seed, pair in enumerate(heights.tolist())]
     for name in ("parked", "oncoming"):
@@ -136,7 +136,7 @@ def along(seen: list[VehicleMeasurement]) -> Floats:
     return np.array([pose.x_m for pose in smooth_vehicle(seen, CONFIG).values()])
 
 
-def test_a_size_known_in_the_end_moves_every_measurement_by_what_its_depth_owed_to_it() -> None:
+def test_final_size_corrects_every_measurement() -> None:
     face_m, reach_m = 38.0, 2.0
     assumed = np.linspace(0.5, 0.4, 30)  # it was assumed ten percent taller than it is
     seen_m = face_m * np.exp(assumed - 0.4) + reach_m
@@ -145,7 +145,7 @@ def test_a_size_known_in_the_end_moves_every_measurement_by_what_its_depth_owed_
     assert smooth_vehicle(measured(seen_m[:1], assumed[:1], 1.0), CONFIG)[0].x_m == pytest.approx(seen_m[0])
 
 
-def test_what_a_cut_car_lies_along_another_line_stays_uncertain() -> None:
+def test_unobserved_direction_of_a_truncated_car_stays_uncertain() -> None:
     """Its error is along the line of sight of the one edge that is seen, most of it by its height."""
     seen = [
         replace_edge(one, T_ego_vehicle=SE2(4.0, 3.0, 0.0), cov=(0.5, 0.6, 0.0, 0.6, 0.73, 0.0, 0.0, 0.0, 0.01))
@@ -155,7 +155,7 @@ def test_what_a_cut_car_lies_along_another_line_stays_uncertain() -> None:
         assert np.hypot(pose.x_m - 4.0, pose.y_m - 3.0) < 0.5
 
 
-def test_a_last_look_that_is_less_sure_of_the_size_moves_little() -> None:
+def test_uncertain_final_size_moves_little() -> None:
     """As at a vehicle that leaves the image, cut by its border: 38 m of 20 % would be 8 m."""
     assumed, sigma = np.full(30, 0.4), np.geomspace(0.08, 0.02, 30)
     assumed[-1], sigma[-1] = 0.6, 0.06
@@ -163,7 +163,7 @@ def test_a_last_look_that_is_less_sure_of_the_size_moves_little() -> None:
     assert np.abs(along(measured(seen_m, assumed, 1.0, sigma_log_height=sigma)) - 40.0).max() < 0.1
 
 
-def test_what_stood_has_one_place_and_what_drove_has_not() -> None:
+def test_stationary_vehicle_has_one_position() -> None:
     noise = np.random.default_rng(3).standard_normal(60)
     still = along(measured(40.0 + noise, standing=0.95))
     assert np.ptp(still) < 0.3
@@ -174,14 +174,14 @@ def test_what_stood_has_one_place_and_what_drove_has_not() -> None:
     assert np.abs(along(measured(driving_m + noise)) - told_wrong).max() == 0.0
 
 
-def test_what_drives_now_hardly_stood_a_moment_before() -> None:
+def test_moving_vehicle_was_moving_just_before() -> None:
     noise = 0.3 * np.random.default_rng(4).standard_normal(40)
     x_m = 30.0 + 0.15 * np.arange(40) + noise
     standing = np.where(np.arange(40) < 4, 0.8, 0.0)  # as a filter has it at first
     assert np.abs(along(measured(x_m, standing=standing)) - along(measured(x_m))).max() == 0.0
 
 
-def test_one_that_stops_stops() -> None:
+def test_stopping_vehicle_stops() -> None:
     x_m = np.concatenate([20.0 + 1.0 * np.arange(20), np.full(30, 39.0)])
     standing = np.where(np.arange(50) < 22, 0.0, 0.97)
     found = along(measured(x_m + 0.3 * np.random.default_rng(5).standard_normal(50), standing=standing))
@@ -189,13 +189,13 @@ def test_one_that_stops_stops() -> None:
     assert np.abs(found - x_m).max() < 1.5
 
 
-def test_an_outlier_counts_for_little() -> None:
+def test_outlier_has_little_weight() -> None:
     x_m = 40.0 + 0.5 * np.arange(40)
     outlier = x_m + 25.0 * (np.arange(40) == 20)
     assert np.abs(along(measured(outlier, sigma_m=0.3)) - x_m).max() < 0.5
 
 
-def test_worlds_are_kept_apart() -> None:
+def test_epochs_are_separate() -> None:
     log = log_of(0, 1.5, 1.5)
     log[20] = replace(log[20], cc=None)
     graph, smoother = PoseGraph(GraphConfig(), WeightsConfig()), RtsSmoother(CONFIG)
@@ -209,7 +209,7 @@ def test_worlds_are_kept_apart() -> None:
         assert all((k >= 20) == (epoch == 1) for k in poses)
 
 
-def test_frames_without_measurements_are_none() -> None:
+def test_frames_without_measurements_give_none() -> None:
     smoother = RtsSmoother(CONFIG)
     graph = PoseGraph(GraphConfig(), WeightsConfig())
     m = Measurements(frame_id=0, t_source_ns=0, t_capture_ns=0, t_utc_ns=0, status=(Status.FRAME_UNREADABLE,))

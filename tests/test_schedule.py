@@ -1,4 +1,4 @@
-"""`[perceive.schedule]`: what it says of each head is what runs."""
+"""`[perceive.schedule]`: each head runs as configured."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ lanes = { hz = 8 }
 
 
 @pytest.mark.parametrize(("rate_hz", "every"), [(33.0, 7), (10.0, 2), (5.0, 1), (2.0, 1)])
-def test_lanes_are_made_out_five_times_a_second_unless_it_is_said_otherwise(rate_hz: float, every: int) -> None:
+def test_lanes_run_five_times_a_second_by_default(rate_hz: float, every: int) -> None:
     configuration = complete(Configuration(), CAMERA, rate_hz)
     assert configuration.perceive.schedule.lanes.every == every
     fixed = complete(Configuration(source=SourceConfig(rate=50.0)), CAMERA, rate_hz)  # the rate it is paced at
@@ -71,7 +71,7 @@ def test_lanes_are_made_out_five_times_a_second_unless_it_is_said_otherwise(rate
         ("detector = { every = 0 }", "perceive.schedule.detector.every"),
     ],
 )
-def test_what_cannot_be_is_refused_by_name(tmp_path: Path, text: str, reason: str) -> None:
+def test_invalid_schedule_is_refused_by_name(tmp_path: Path, text: str, reason: str) -> None:
     with pytest.raises(ConfigurationError, match=reason):
         of_toml(tmp_path, f"[perceive.schedule]\n{text}\n")
 
@@ -122,7 +122,7 @@ def test_frames_whose_perception_is_not_taken_are_yielded_too() -> None:
         assert list(networks.in_order([])) == []
 
 
-def test_of_frames_before_the_one_that_is_looked_at_no_more_detections_come() -> None:
+def test_no_detections_come_for_earlier_frames() -> None:
     head = Gated("detector", ModelSpec("none.onnx", every=2, awaited=False))
     with ThreadPoolExecutor(1) as threads:
         networks = Networks([head], threads.submit, patience_s=0.0)
@@ -135,7 +135,7 @@ def test_of_frames_before_the_one_that_is_looked_at_no_more_detections_come() ->
         assert pending.result().awaited_from == 7
 
 
-def test_each_head_runs_on_its_frames_and_a_late_one_is_skipped_and_said_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_late_head_is_skipped_with_status(monkeypatch: pytest.MonkeyPatch) -> None:
     heads: dict[str, Gated] = {}
 
     def loaded(role: str, spec: ModelSpec, *others: object) -> Head:

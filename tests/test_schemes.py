@@ -1,4 +1,4 @@
-"""The table of sources: its facts hold, all commands use it, and a new source is one file and one entry."""
+"""The table of sources: all commands use it, and a new source is one file and one entry."""
 
 from __future__ import annotations
 
@@ -51,13 +51,13 @@ def test_a_schemes_camera_facts_are_those_of_its_class(scheme: Scheme) -> None:
         assert kind.frame_size.__func__ is not Recording.frame_size.__func__ or scheme.camera == "calibration"
 
 
-def test_the_options_are_keys_and_each_key_is_somebodys() -> None:
+def test_every_option_is_a_key_of_a_source() -> None:
     taken = {option for scheme in table.all_schemes() for option in scheme.options}
     assert {key for scheme in table.all_schemes() for key in scheme.refused} < taken
     assert taken | {"uri", "rate", "frames"} == set(SourceConfig.__struct_fields__)
 
 
-def test_each_table_names_classes_of_its_own_floor() -> None:
+def test_each_table_names_classes_of_its_own_layer() -> None:
     """An opener is named in a string, which the walls of test_architecture.py do not see."""
     assert all(scheme.opener.startswith("birdslam.sources.") for scheme in schemes.RECORDED)
     runtime = {scheme.opener.rpartition(".")[0] for scheme in table.OF_THE_RUNTIME}

@@ -1,4 +1,4 @@
-"""The laws of the group SE(2)."""
+"""Properties of the group SE(2)."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Who may read and who may write: real sessions at the gate and at the vehicle's sockets, let in or refused.
+"""Access control: sessions at the gate and at the vehicle's sockets, accepted or refused.
 
 Certificates come from deploy/certificates.sh, the gate's file is the one that is installed.
 """
@@ -207,7 +207,7 @@ def keys(topics: set[str]) -> set[str]:
     return {key_of("car", topic) for topic in topics}
 
 
-def test_the_gates_file_speaks_of_the_topology_and_of_nothing_else() -> None:
+def test_gate_file_covers_exactly_the_topology() -> None:
     config = zenoh.Config.from_file(str(DEPLOY / "gate.json5"))
     access = json.loads(config.get_json("access_control"))
     alive = zenoh.KeyExpr(alive_key("car", "optimize"))
@@ -223,7 +223,7 @@ def test_the_gates_file_speaks_of_the_topology_and_of_nothing_else() -> None:
 
 
 @needs_openssl
-def test_a_planner_reads_what_it_may_and_no_more(vehicle: Vehicle, certificates: Path) -> None:
+def test_planner_reads_only_permitted_topics(vehicle: Vehicle, certificates: Path) -> None:
     with outside(certificates, vehicle.port) as session:
         heard = hear(vehicle, session, keys(READABLE))
         until(lambda: len(heard.alive) == len(PROCESSES), "all nodes are alive")
@@ -237,7 +237,7 @@ def answers(session: zenoh.Session, topic: str, limit_s: float = 2.0) -> int:
 
 
 @needs_openssl
-def test_a_planner_asks_what_it_may_and_no_more(vehicle: Vehicle, certificates: Path) -> None:
+def test_planner_sends_only_permitted_queries(vehicle: Vehicle, certificates: Path) -> None:
     with outside(certificates, vehicle.port) as session, outside(certificates, vehicle.port, "stranger") as stranger:
         hear(vehicle, session, keys(READABLE))  # each node has said something, which it keeps
         for topic in ASKABLE:
@@ -252,7 +252,7 @@ def test_a_planner_asks_what_it_may_and_no_more(vehicle: Vehicle, certificates: 
 
 
 @needs_openssl
-def test_nobody_outside_writes(vehicle: Vehicle, certificates: Path) -> None:
+def test_outsiders_cannot_write(vehicle: Vehicle, certificates: Path) -> None:
     """A planner with all its rights sends valid messages of every topic, tokens and answers: none comes in."""
     with outside(certificates, vehicle.port) as session, outside(certificates, vehicle.port) as other:
         heard = hear(vehicle, other, keys(READABLE))
@@ -291,7 +291,7 @@ def test_nobody_outside_writes(vehicle: Vehicle, certificates: Path) -> None:
 
 
 @needs_openssl
-def test_the_car_alone_says_its_speed_and_nothing_else(vehicle: Vehicle, certificates: Path) -> None:
+def test_only_the_car_may_publish_speed(vehicle: Vehicle, certificates: Path) -> None:
     """Beside it a planner with all its rights, and whoever is not on the list."""
     with outside(certificates, vehicle.port, "car") as car, ExitStack() as others:
         heard = Heard()
@@ -385,7 +385,7 @@ def test_a_planner_is_refused(vehicle: Vehicle, certificates: Path, who: str, au
 
 
 @needs_openssl
-def test_the_gate_speaks_nothing_but_tls(vehicle: Vehicle) -> None:
+def test_gate_accepts_only_tls(vehicle: Vehicle) -> None:
     config = zenoh.Config()
     for key, value in (
         ("mode", "client"),
@@ -413,7 +413,7 @@ def test_a_peer_learns_no_way_around_the_gate(vehicle: Vehicle, certificates: Pa
 
 
 @needs_openssl
-def test_noise_and_giants_leave_the_gate_standing(vehicle: Vehicle, certificates: Path) -> None:
+def test_noise_and_oversized_messages_do_not_stop_the_gate(vehicle: Vehicle, certificates: Path) -> None:
     """Who is in goes on reading meanwhile; who comes again may knock twice (zenoh pauses after a bad handshake)."""
     with outside(certificates, vehicle.port) as session:
         silent = [socket.create_connection(("127.0.0.1", vehicle.port)) for _ in range(8)]
@@ -434,7 +434,7 @@ def test_noise_and_giants_leave_the_gate_standing(vehicle: Vehicle, certificates
 
 
 @needs_openssl
-def test_a_planner_lives_through_a_restart_of_the_vehicle(vehicle: Vehicle, certificates: Path) -> None:
+def test_planner_survives_a_restart_of_the_vehicle(vehicle: Vehicle, certificates: Path) -> None:
     with outside(certificates, vehicle.port) as session:
         heard = hear(vehicle, session, keys({"estimate"}))
         vehicle.nodes["optimize"].close()
@@ -538,9 +538,7 @@ def test_certificates_are_kept_and_made_only_by_the_authority(certificates: Path
         ("{\n", "", "gate.json5"),
     ],
 )
-def test_a_gate_that_would_be_open_does_not_start(
-    tmp_path: Path, certificates: Path, old: str, new: str, reason: str
-) -> None:
+def test_open_gate_does_not_start(tmp_path: Path, certificates: Path, old: str, new: str, reason: str) -> None:
     gate_config(gate_file(tmp_path, certificates, 1), "car", tmp_path / "rt")
 
     def change(text: str) -> str:
@@ -552,7 +550,7 @@ def test_a_gate_that_would_be_open_does_not_start(
     assert "gate.json5" in str(caught.value)
 
 
-def test_a_gate_says_what_is_wrong_in_one_line(tmp_path: Path) -> None:
+def test_gate_error_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "car.toml").write_text("")
     done = subprocess.run(
         [sys.executable, "-P", "-m", "birdslam.runtime.gate", str(tmp_path / "car.toml"), str(tmp_path / "none.json5")],
@@ -566,7 +564,7 @@ def test_a_gate_says_what_is_wrong_in_one_line(tmp_path: Path) -> None:
     assert "none.json5" in done.stderr
 
 
-def test_a_message_over_the_limit_is_never_put_together(tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_message_over_the_limit_is_not_reassembled(tmp_path_factory: pytest.TempPathFactory) -> None:
     """From a process of the vehicle's own user, past the checks of our own sender."""
     base = tmp_path_factory.mktemp("run")
     with Bus("car", "supervisor", hub=True, runtime_dir=base) as hub:

@@ -1,4 +1,4 @@
-"""Segmentation networks of any classes: lists of classes by argmax, scores and logits against a threshold."""
+"""Segmentation networks with any classes: lists of classes by argmax, scores and logits with a threshold."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def run(tmp_path: Path, text: str, scores: np.ndarray) -> Segmentation:
     return found.segmentation
 
 
-def test_a_list_of_classes_is_where_one_of_them_is_the_largest(tmp_path: Path) -> None:
+def test_list_of_classes_selects_by_argmax(tmp_path: Path) -> None:
     scores = np.random.default_rng(0).normal(size=(1, 4, 8, 8))
     road = run(tmp_path, MANIFEST.replace("CHANNEL", "[0, 3]"), scores).road
     np.testing.assert_array_equal(road, np.isin(scores[0].argmax(axis=0), [0, 3]))
@@ -36,7 +36,7 @@ def test_a_list_of_classes_is_where_one_of_them_is_the_largest(tmp_path: Path) -
     np.testing.assert_array_equal(road, scores[0].argmax(axis=0) == 2)
 
 
-def test_logits_are_held_against_a_probability(tmp_path: Path) -> None:
+def test_logits_are_compared_with_a_probability(tmp_path: Path) -> None:
     logits = np.random.default_rng(1).normal(size=(1, 4, 8, 8))
     probability = 1.0 / (1.0 + np.exp(-logits[0]))
     text = MANIFEST + 'rule = "above"\nthreshold = 0.7\nsigmoid = true\n'
@@ -58,6 +58,6 @@ def test_logits_are_held_against_a_probability(tmp_path: Path) -> None:
         ("0", 'rule = "above"\nsigmoid = true\nthreshold = 1.0', "sigmoid needs rule"),
     ],
 )
-def test_a_list_that_makes_no_sense_is_refused(tmp_path: Path, channel: str, more: str, named: str) -> None:
+def test_invalid_list_is_refused(tmp_path: Path, channel: str, more: str, named: str) -> None:
     with pytest.raises(ModelError, match=named.replace("[", r"\[")):
         run(tmp_path, MANIFEST.replace("CHANNEL", channel) + more, np.zeros((1, 4, 8, 8)))

@@ -1,4 +1,4 @@
-"""The statuses by which the front end doubts itself, on recorded frames that were edited: KITTI 06, a straight road."""
+"""Self-check statuses of the front end, on edited frames of KITTI 06, a straight road."""
 
 from __future__ import annotations
 
@@ -80,16 +80,14 @@ def turned(camera: Camera, axis: int, angle_deg: float) -> Callable[[Image], Ima
     )
 
 
-def test_an_unedited_drive_doubts_nothing(recorded: tuple[Camera, list[Image]]) -> None:
+def test_unedited_drive_has_no_status(recorded: tuple[Camera, list[Image]]) -> None:
     estimates = drive(*recorded)
     assert {status for e in estimates[4:] for status in e.status} == set()
     assert all(e.valid for e in estimates[4:])
 
 
 @pytest.mark.parametrize("angle_deg", first(1, [1.5, -1.5]))
-def test_a_knock_of_the_calibrated_camera_is_followed_at_once_and_told(
-    recorded: tuple[Camera, list[Image]], angle_deg: float
-) -> None:
+def test_knock_of_the_camera_is_corrected_and_reported(recorded: tuple[Camera, list[Image]], angle_deg: float) -> None:
     camera, images = recorded
     known = msgspec.structs.replace(camera, pitch_rad=PITCH_RAD, roll_rad=ROLL_RAD, tilt_sigma_rad=0.004)
     knock = turned(camera, 0, angle_deg)
@@ -105,7 +103,7 @@ def test_a_knock_of_the_calibrated_camera_is_followed_at_once_and_told(
 
 
 @pytest.mark.slow  # a knock of 1.5 degrees is followed above
-def test_a_camera_turned_by_far_is_found_again(recorded: tuple[Camera, list[Image]]) -> None:
+def test_large_rotation_of_the_camera_is_found(recorded: tuple[Camera, list[Image]]) -> None:
     camera, images = recorded
     knock = turned(camera, 0, 3.5)
     estimates = drive(camera, images, lambda k, image: knock(image) if k >= 15 else image)
@@ -115,7 +113,7 @@ def test_a_camera_turned_by_far_is_found_again(recorded: tuple[Camera, list[Imag
     assert estimates[-1].ground.pitch_rad == pytest.approx(PITCH_RAD + math.radians(3.5), abs=math.radians(0.7))
 
 
-def test_a_road_that_is_none_violates_the_ground(recorded: tuple[Camera, list[Image]]) -> None:
+def test_non_planar_road_violates_the_ground(recorded: tuple[Camera, list[Image]]) -> None:
     rng = np.random.default_rng(5)
 
     def flood(k: int, image: Image) -> Image:
@@ -132,7 +130,7 @@ def test_a_road_that_is_none_violates_the_ground(recorded: tuple[Camera, list[Im
     assert carrying(Status.SCALE_CARRIED, estimates)
 
 
-def test_a_hidden_road_and_a_lost_view_leave_no_scale(recorded: tuple[Camera, list[Image]]) -> None:
+def test_hidden_road_and_lost_view_invalidate_the_scale(recorded: tuple[Camera, list[Image]]) -> None:
     camera, images = recorded
     hidden = np.zeros((camera.height_px, camera.width_px), np.bool_)
     empty = np.tile(np.linspace(60, 120, camera.width_px, dtype=np.uint8), (camera.height_px, 1))
@@ -175,7 +173,7 @@ def test_a_frozen_and_a_dark_camera(recorded: tuple[Camera, list[Image]]) -> Non
     assert estimates[-1].valid
 
 
-def test_a_car_that_stands_where_nothing_was_ever_measured_knows_no_metres(
+def test_stationary_start_has_no_scale(
     recorded: tuple[Camera, list[Image]],
 ) -> None:
     """One picture with the noise of a sensor: as of a parked car, or of a screen in front of the camera."""
@@ -192,7 +190,7 @@ def test_a_car_that_stands_where_nothing_was_ever_measured_knows_no_metres(
     assert not any(e.valid for e in estimates)
 
 
-def test_a_stop_keeps_the_metres_that_were_known(recorded: tuple[Camera, list[Image]]) -> None:
+def test_stop_keeps_the_scale(recorded: tuple[Camera, list[Image]]) -> None:
     camera, images = recorded
     rng = np.random.default_rng(4)
 
@@ -257,7 +255,7 @@ def _watched(
 
 
 @pytest.mark.parametrize("wrong", [0.8, 1.0, 1.25])
-def test_the_height_by_the_vehicles(wrong: float) -> None:
+def test_height_is_estimated_from_vehicles(wrong: float) -> None:
     watch, told = _watched(wrong * 1.65)
     ratio, sigma_rel, vehicles = watch.estimate
     assert vehicles == 40
@@ -268,7 +266,7 @@ def test_the_height_by_the_vehicles(wrong: float) -> None:
 
 
 @pytest.mark.parametrize("tilt_error_rad", [-0.005, 0.005])
-def test_an_error_of_the_tilt_is_not_taken_for_one_of_the_height(tilt_error_rad: float) -> None:
+def test_tilt_error_is_not_a_height_error(tilt_error_rad: float) -> None:
     """At 17 m it is worth 5 % of the slope of a vehicle's bottom."""
 
     def moved(config: CameraHeightConfig) -> float:
@@ -280,14 +278,14 @@ def test_an_error_of_the_tilt_is_not_taken_for_one_of_the_height(tilt_error_rad:
     assert abs(doubted) < 0.75 * abs(believed)
 
 
-def test_the_height_is_not_judged_without_a_known_tilt() -> None:
+def test_height_needs_a_known_tilt() -> None:
     watch, told = _watched(1.25 * 1.65, Status.SCALE_CARRIED)
     assert watch.estimate[2] == 0
     assert not any(told)
 
 
 @pytest.mark.slow  # a whole sequence
-def test_real_boxes_before_a_camera_that_stands_as_stated_raise_no_alarm(data_dir: Path) -> None:
+def test_correct_camera_raises_no_alarm_on_real_boxes(data_dir: Path) -> None:
     """KITTI tracking 0004: its camera looks down by half a degree, of which the file knows nothing."""
     root = data_dir / "kitti_tracking" / "training"
     sequence = open_tracking(root, "0004")

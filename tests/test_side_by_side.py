@@ -1,4 +1,4 @@
-"""Drives over recordings beside each other and beside a live car, as real processes."""
+"""Parallel drives over recordings, beside each other and beside a live car, as real processes."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def begin(place: Path, name: str) -> subprocess.Popen[str]:
 
 @pytest.mark.processes
 @pytest.mark.parametrize("films", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_films_run_beside_each_other_and_beside_a_live_car(place: Path, films: int) -> None:
+def test_films_run_in_parallel_with_a_live_car(place: Path, films: int) -> None:
     with VehicleLock("car"):  # the live one, whom planners find by this name
         runs = {name: begin(place, name) for name in ("a", "b")[:films]}
         told = {name: run.communicate(timeout=LIMIT_S) for name, run in runs.items()}
@@ -70,7 +70,7 @@ def test_films_run_beside_each_other_and_beside_a_live_car(place: Path, films: i
     assert left == ["car"]
 
 
-def test_what_a_killed_drive_left_goes_with_the_next_one(place: Path) -> None:
+def test_leftovers_of_a_killed_drive_are_removed_by_the_next(place: Path) -> None:
     with own_runtime_dir("car") as directory:
         dead = directory.with_name("own-999999999")  # no such process
         (dead / "car").mkdir(parents=True, mode=0o700)

@@ -1,4 +1,4 @@
-"""The update by boxes with outlying sides: against Kalman's, against each case on its own, and on a hidden car."""
+"""The update with outlying box sides: compared with Kalman's and with each mixture component."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_without_outliers_it_is_kalmans_update(seed: int) -> None:
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.01, 0.3))
-def test_it_is_the_mixture_of_its_three_cases(seed: int, share: float) -> None:
+def test_update_is_the_mixture_of_three_cases(seed: int, share: float) -> None:
     P, J, noise, innovation, off = problem(seed)
     PJt = P @ J.swapaxes(-1, -2)
     after = update_with_side_outliers(P, PJt, J @ PJt + noise, innovation, off, np.full((2, N), share))
@@ -103,7 +103,7 @@ def drive_past(config: ParallaxConfig, hidden: float) -> tuple[float, Floats]:
     return parallax.stationary_probability(0), outlier
 
 
-def test_a_parked_car_that_a_tree_hides_in_part_still_stands() -> None:
+def test_partly_hidden_parked_car_stays_stationary() -> None:
     standing, outlier = drive_past(ParallaxConfig(), hidden=0.4)
     assert standing > 0.5
     assert outlier[0] > 0.9
@@ -112,7 +112,7 @@ def test_a_parked_car_that_a_tree_hides_in_part_still_stands() -> None:
     assert unaware < standing
 
 
-def test_a_car_in_plain_view_has_no_outlying_side() -> None:
+def test_fully_visible_car_has_no_outlying_side() -> None:
     standing, outlier = drive_past(ParallaxConfig(), hidden=0.0)
     assert standing > 0.9
     assert (outlier < ParallaxConfig().side_outlier).all()

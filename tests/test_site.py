@@ -1,4 +1,4 @@
-"""The search of the site that is opened from disk: its script, in a browser. That the site builds is `make site`."""
+"""The search of the site opened from disk: its script in a browser. `make site` tests the build."""
 
 from __future__ import annotations
 

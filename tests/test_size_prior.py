@@ -1,4 +1,4 @@
-"""The prior of heights: a drive's common part and Student's t; and what the tilt is learned from."""
+"""The prior of heights: a drive's common part and Student's t; and information on the tilt."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def measured(x: np.ndarray, P: np.ndarray, log_height: float, sigma: float) -> t
     return x + gain * (log_height - x[1]), P - np.outer(gain, P[1])
 
 
-def test_a_height_begins_with_the_spread_of_its_class_and_shares_a_drives_part() -> None:
+def test_height_prior_has_class_spread_and_common_part() -> None:
     prior, x, P = born()
     assert math.sqrt(P[1, 1]) == pytest.approx(SIGMA)
     same_x, same_P = prior.reweigh([0, 1], x, P, AT, 0)
@@ -46,7 +46,7 @@ def test_a_height_begins_with_the_spread_of_its_class_and_shares_a_drives_part()
 
 
 @pytest.mark.parametrize(("height_m", "nearer"), [(1.85, True), (1.5, False)])
-def test_tails_of_the_prior_let_tall_cars_be_tall_and_hold_usual_ones_more(height_m: float, nearer: bool) -> None:
+def test_heavy_tails_allow_tall_cars(height_m: float, nearer: bool) -> None:
     found = {}
     for dof in (DOF, math.inf):
         prior, x, P = born(dof)
@@ -62,7 +62,7 @@ def test_tails_of_the_prior_let_tall_cars_be_tall_and_hold_usual_ones_more(heigh
         assert found[DOF][1] < found[math.inf][1]
 
 
-def test_a_new_weight_is_what_a_prior_of_that_weight_would_have_given() -> None:
+def test_reweighting_equals_a_prior_of_that_weight() -> None:
     prior, x, P = born()
     x, P = prior.reweigh([0, 1], *measured(x, P, math.log(1.9), 0.05), AT, 0)
     information = np.zeros((3, 3))
@@ -77,7 +77,7 @@ def test_a_new_weight_is_what_a_prior_of_that_weight_would_have_given() -> None:
     assert np.linalg.inv(information)[1, 1] == pytest.approx(P[1, 1], rel=0.1)
 
 
-def test_another_prior_is_as_if_the_vehicle_had_begun_with_it() -> None:
+def test_changed_prior_equals_initial_prior() -> None:
     prior, x, P = born()
     x, P = measured(x, P, math.log(1.55), 0.05)
     changed_x, changed_P = prior.replace(0, x, P, (1, 0), 2.1, 0.12)
@@ -89,7 +89,7 @@ def test_another_prior_is_as_if_the_vehicle_had_begun_with_it() -> None:
     assert changed_P == pytest.approx(fresh_P)
 
 
-def test_a_roll_of_the_images_that_is_off_for_long_stays_in_the_sigma() -> None:
+def test_correlated_roll_error_stays_in_the_sigma() -> None:
     ground_size = GroundSizeFilter(CAMERA, GroundSizeConfig())
     for k in range(300):
         tilt = GroundPlane(CAMERA.height_m, 0.0, 0.008 + 1e-9 * k)

@@ -31,14 +31,14 @@ def series(mib: list[float], descriptors: list[int]) -> Series:
     return Series([5.0 * k for k in range(len(mib))], mib, descriptors, {1})
 
 
-def test_a_flat_drive_is_well(systemd: Systemd) -> None:
+def test_constant_series_pass(systemd: Systemd) -> None:
     flat = series([100.0, 130.0, 100.2, 100.1, 100.3, 100.4] * 4, [30, 31, 30, 30, 29, 30] * 4)  # it swings
     assert list(faults({"perceive": flat}, WELL, systemd)) == []
     (row,) = [line for line in table({"perceive": flat}, WELL, systemd).splitlines() if line.startswith("| perceive")]
     assert row.endswith("| 0 | 3 |")
 
 
-def test_what_a_start_makes_once_is_not_carried_on(systemd: Systemd) -> None:
+def test_growth_at_start_is_not_extrapolated(systemd: Systemd) -> None:
     rng = np.random.default_rng(3)
     warm = series([*np.linspace(100.0, 100.8, 60), *(100.8 + 0.01 * rng.normal(size=60))], [30] * 120)
     assert list(faults({"map": warm}, WELL, systemd)) == []
@@ -48,7 +48,7 @@ def test_what_a_start_makes_once_is_not_carried_on(systemd: Systemd) -> None:
     assert said.endswith("in 8 hours")
 
 
-def test_one_step_is_no_growth_and_many_are_one(systemd: Systemd) -> None:
+def test_one_step_is_not_growth_and_many_are(systemd: Systemd) -> None:
     one = series([210.9] * 164 + [211.9] * 64, [30] * 228)  # 1 MiB at once in 19 minutes: a table that doubles
     assert list(faults({"supervisor": one}, WELL, systemd)) == []
     gain, sigma = one.in_a_shift()
@@ -57,7 +57,7 @@ def test_one_step_is_no_growth_and_many_are_one(systemd: Systemd) -> None:
     assert any("perceive would grow by" in said for said in faults({"perceive": many}, WELL, systemd))
 
 
-def test_the_sigma_of_a_drift_is_what_a_drift_scatters() -> None:
+def test_sigma_of_drift_is_consistent() -> None:
     t_s, rng = np.arange(0.0, 3600.0, 5.0), np.random.default_rng(7)
     found = []
     for _ in range(300):
@@ -81,11 +81,11 @@ def test_the_sigma_of_a_drift_is_what_a_drift_scatters() -> None:
         ),
     ],
 )
-def test_what_grows_is_named(one: Series, said: str, systemd: Systemd) -> None:
+def test_growth_is_named(one: Series, said: str, systemd: Systemd) -> None:
     assert list(faults({"perceive": one}, WELL, systemd)) == [said]
 
 
-def test_estimates_that_come_later_and_later_are_named() -> None:
+def test_growing_age_is_named() -> None:
     t_s = [0.03 * k for k in range(400)]
     said, bad = ages(Ages(t_s, [20.0, 22.0, 21.0, 40.0] * 100))
     assert said.startswith("age at the planner, first quarter p50 21.5, p99 40.0 ms; last 21.5, 40.0 ms; p50 +0.0 +-")
@@ -95,7 +95,7 @@ def test_estimates_that_come_later_and_later_are_named() -> None:
     assert "p50 +6000.0 +- 0.0 ms an hour" in said  # 0.05 ms in 0.03 s
 
 
-def test_the_sigma_of_a_slope_is_what_a_slope_scatters() -> None:
+def test_sigma_of_slope_is_consistent() -> None:
     t_s, rng = np.arange(0.0, 3600.0, 5.0), np.random.default_rng(5)
     found = []
     for _ in range(300):

@@ -1,4 +1,4 @@
-"""Sources: pacing that does not drift, reading ahead, what a slow reader costs, and cameras that are not there."""
+"""Sources: pacing without drift, read-ahead, slow readers, and missing cameras."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_the_pace_of_the_time_stamps_does_not_drift(steps_ns: list[int], first_n
 
 
 @given(st.floats(1.0, 1000.0), st.integers(0, 100_000))
-def test_a_given_rate_does_not_drift_either(rate: float, frame_id: int) -> None:
+def test_given_rate_does_not_drift(rate: float, frame_id: int) -> None:
     pacer = Pacer(rate)
     pacer.due_ns(0, 0, 5)
     assert pacer.due_ns(frame_id, 123, 456) - 5 == pytest.approx(frame_id * 1e9 / rate, abs=1.0)
@@ -86,7 +86,7 @@ def test_rate_max_is_always_due() -> None:
     assert [Pacer("max").due_ns(i, 10**12 * i, 7) for i in range(3)] == [7, 7, 7]
 
 
-def test_a_recording_is_read_whole_whatever_the_reader_does() -> None:
+def test_recording_is_read_completely_with_any_reader() -> None:
     reader = ReadAhead(RecordedSource(Frames(9, TORN), SourceConfig()), capacity=2)
     seen = []
     for _ in range(9):
@@ -121,7 +121,7 @@ def test_a_slow_reader_of_a_camera_gets_the_newest_frame_and_the_count() -> None
     camera.tick.release()
 
 
-def test_what_a_source_raises_reaches_the_reader() -> None:
+def test_source_exceptions_reach_the_reader() -> None:
     camera = Live(SourceError("camera: gone"))
     reader = ReadAhead(camera, capacity=1)
     camera.tick.release()
@@ -136,7 +136,7 @@ def test_closing_ends_a_reader_that_waits() -> None:
     assert not any(thread.name == "read-ahead" and thread.is_alive() for thread in threading.enumerate())
 
 
-def test_a_loop_goes_on_in_time_and_ends_after_so_many_frames() -> None:
+def test_loop_continues_in_time_up_to_its_frame_limit() -> None:
     source = RecordedSource(Frames(4, TORN), SourceConfig(loop=True, frames=10))
     times = [frame.t_source_ns for frame in source.frames()]
     assert times == [PERIOD_NS * i for i in range(10)]
@@ -159,7 +159,7 @@ def test_an_image_of_another_size_costs_one_frame(caplog: pytest.LogCaptureFixtu
     assert "frame 7 is unreadable: image of 64x30 does not fit the camera of 64x32" in caplog.text
 
 
-def test_distortion_is_taken_out_on_the_way() -> None:
+def test_frames_are_undistorted() -> None:
     camera = msgspec.structs.replace(CAMERA, distortion=(-0.3, 0.1, 0.0, 0.0))
     pixels = np.random.default_rng(3).integers(0, 256, (32, 64), dtype=np.uint8)
     frame = to_frame(Undistorter(camera), 0, RecordedFrame(0, 0, pixels), t_capture_ns=0)
@@ -176,7 +176,7 @@ def test_distortion_is_taken_out_on_the_way() -> None:
         ({"source.uri": "v4l2:/dev/none"}, "needs a camera file"),
     ],
 )
-def test_a_source_that_can_be_none(overrides: dict[str, str], message: str) -> None:
+def test_invalid_source_is_refused(overrides: dict[str, str], message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):
         open_source(load(None, overrides))
 
@@ -191,7 +191,7 @@ def test_a_missing_recording_is_named(tmp_path: Path) -> None:
         open_source(live(f"kitti:{tmp_path / 'nowhere'}"))
 
 
-def test_a_camera_that_is_not_there_is_named(tmp_path: Path) -> None:
+def test_missing_camera_is_named(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match=r"v4l2:/dev/no_such: no such device: /dev/no_such"):
         open_source(live("v4l2:/dev/no_such"))
     file = tmp_path / "video0"
@@ -233,7 +233,7 @@ class Unplugged:
         self._open = False
 
 
-def test_a_camera_that_comes_back_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_reconnected_camera_continues(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     device = tmp_path / "video0"
     device.touch()
     monkeypatch.setattr(cv2, "VideoCapture", Unplugged)
@@ -251,7 +251,7 @@ def test_a_camera_that_comes_back_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_p
 
 
 @given(st.integers(0, 40), st.booleans(), st.one_of(st.none(), st.integers(1, 40)))
-def test_a_resumed_recording_goes_on_where_it_was(start: int, loop: bool, frames: int | None) -> None:
+def test_resumed_recording_continues(start: int, loop: bool, frames: int | None) -> None:
     if loop and frames is None:
         frames = 40
 

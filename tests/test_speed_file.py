@@ -1,4 +1,4 @@
-"""The car's own speed beside a recording: what a file may say, and which frame bears which of its readings."""
+"""The car's speed for a recording: file formats, and the readings of each frame."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def file(folder: Path, text: str) -> Path:
     return path
 
 
-def test_a_line_says_as_much_as_it_knows(tmp_path: Path) -> None:
+def test_columns_are_optional(tmp_path: Path) -> None:
     text = "# t v\n\n0.5 10\n1, 10.5\n1.5 11 0.25 # wheels\n2,-1,,0.125\n2.5,12,0.5,-0.25,0.0625\n3,13,,,\n"
     gyro = {"yaw_rate_radps": 0.125, "yaw_rate_sigma_radps": YAW_RATE_SIGMA_RADPS}
     exact = {"yaw_rate_radps": -0.25, "yaw_rate_sigma_radps": 0.0625}
@@ -73,7 +73,7 @@ def test_a_file_without_speeds_is_named(tmp_path: Path) -> None:
             read_speeds(path)
 
 
-def test_what_a_failing_sensor_says_is_passed_on_but_calibrates_nothing(tmp_path: Path) -> None:
+def test_readings_of_a_failing_sensor_are_passed_on_unused(tmp_path: Path) -> None:
     path = file(tmp_path, "0 1\n1 nan\n2 900\n1.5 3\n3 4 nan\n")
     log = read_speeds(path)
     assert [one.t_ns // 10**8 for one in log.readings] == [0, 10, 20, 15, 30]
@@ -101,7 +101,7 @@ def test_a_frame_carries_at_most_the_newest_readings() -> None:
     assert borne[-1].t_ns == 2_000_000_000
 
 
-def test_the_same_frames_bear_the_same_readings_offline_and_in_a_loop(tmp_path: Path) -> None:
+def test_readings_of_frames_are_the_same_offline_and_looped(tmp_path: Path) -> None:
     path = file(tmp_path, "".join(f"{0.02 * number} {number}\n" for number in range(40)))
     recording = with_speeds(Frames(5), path)
     borne = [frame.speeds for frame in recording.undistorted_frames()]
@@ -120,7 +120,7 @@ def test_a_file_of_another_clock_is_named(tmp_path: Path) -> None:
             with_speeds(Frames(5), file(tmp_path, text))
 
 
-def test_a_speed_file_is_asked_for_by_the_configuration(tmp_path: Path) -> None:
+def test_configuration_names_the_speed_file(tmp_path: Path) -> None:
     (tmp_path / "car.toml").write_text('[source]\nuri = "demo"\nspeed = "speed.csv"\n')
     path = file(tmp_path, "0 12\n0.02 12.5\n")
     configuration = load(tmp_path / "car.toml")
@@ -157,7 +157,7 @@ def test_bad_speed_files_of_an_evaluation_are_one_line(tmp_path: Path, capsys: p
 
 
 @given(st.permutations(["time_s", "speed_kmh", "sigma_mps", "note"]), st.floats(0.0, 200.0))
-def test_named_columns_may_stand_in_any_order(columns: list[str], kmh: float) -> None:
+def test_named_columns_may_be_in_any_order(columns: list[str], kmh: float) -> None:
     cells = {"time_s": "1.5", "speed_kmh": repr(kmh), "sigma_mps": "0.25", "note": "wet"}
     with tempfile.TemporaryDirectory() as folder:
         path = file(Path(folder), f"{','.join(columns)}\n{','.join(cells[name] for name in columns)}\n")
@@ -166,7 +166,7 @@ def test_named_columns_may_stand_in_any_order(columns: list[str], kmh: float) ->
     assert found.speed_mps == pytest.approx(kmh / 3.6)
 
 
-def test_a_gps_of_1_hz_is_filled_up_and_says_how_sure_it_is(tmp_path: Path) -> None:
+def test_gps_at_1_hz_is_interpolated_with_sigma(tmp_path: Path) -> None:
     text = (
         "time_s,latitude_deg,longitude_deg,speed_mps\n0.5,51.0,-114.0,10.0\n1.5,51.0,-114.0,12.0\n9.5,51.0,-114.0,12\n"
     )
@@ -192,7 +192,7 @@ def test_fixes_alone_give_the_speed(tmp_path: Path) -> None:
         ("time_s,speed_mps\n1\n", "line 2 does not match"),
     ],
 )
-def test_a_table_that_is_none_is_named(text: str, said: str, tmp_path: Path) -> None:
+def test_invalid_table_is_named(text: str, said: str, tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=said):
         read_speeds(file(tmp_path, text))
 

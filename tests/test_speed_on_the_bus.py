@@ -164,7 +164,7 @@ def capturing(monkeypatch: pytest.MonkeyPatch, place: Path, bus: Bus, source: So
 
 
 @pytest.mark.processes
-def test_frames_bear_what_a_car_says_at_50_hz_malformed_and_flooding(
+def test_frames_carry_readings_at_50_hz_despite_malformed_messages(
     monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     place = tmp_path_factory.mktemp("s")
@@ -229,7 +229,7 @@ class FakeBus:
         return self.inboxes.setdefault(topic, Inbox())
 
 
-def test_a_recordings_own_readings_go_before_those_of_the_bus(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_readings_of_a_recording_override_the_bus(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     own, bus = (reading(0, 7.0),), FakeBus()
     for name, speeds in (("own", own), ("none", ())):
         node = capturing(monkeypatch, tmp_path / name, bus, Source(False, speeds), rate=1e4)  # type: ignore[arg-type]
@@ -265,7 +265,7 @@ class RecorderBus(FakeBus):
 
 
 @given(st.lists(st.integers(0, 3), max_size=12), st.data())
-def test_what_a_frame_adds_is_what_came_since_the_one_before(said: list[int], data: st.DataObject) -> None:
+def test_frame_adds_readings_since_the_previous_one(said: list[int], data: st.DataObject) -> None:
     """Of a car that says something else each time; one that repeats itself may be taken to have said it once."""
     readings = [reading(number, math.nan if kind == 0 else float(kind)) for number, kind in enumerate(said)]
     begin = data.draw(st.integers(0, len(said)))
@@ -276,7 +276,7 @@ def test_what_a_frame_adds_is_what_came_since_the_one_before(said: list[int], da
     assert added(before, after) == after[end - later :]
 
 
-def test_a_recording_gives_its_frames_the_readings_that_they_bore(tmp_path: Path) -> None:
+def test_recording_restores_the_readings_of_frames(tmp_path: Path) -> None:
     path = tmp_path / "drive.mcap"
     recorded = Configuration(recording=RecordingConfig(file=str(path), images=True), camera=CAMERA)
     writer = RecordingWriter(path, about(recorded, {}), CAMERA, flush_ms=1e-3, sync=False)
@@ -319,7 +319,7 @@ def test_a_recording_gives_its_frames_the_readings_that_they_bore(tmp_path: Path
 # --- what the metres rest on ---
 
 
-def test_an_estimate_says_what_its_metres_rest_on() -> None:
+def test_estimate_reports_its_scale_source() -> None:
     graph = PoseGraph(GraphConfig(), WeightsConfig())
     said = []
     for frame in range(4):

@@ -1,4 +1,4 @@
-"""Whether vehicles stand or drive: the decision, and the velocity that planners are told."""
+"""Whether vehicles are stationary or moving: the decision, and the velocity in estimates."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def reported(vehicle: VehicleNode, v_mps: tuple[float, float], cov: Floats) -> t
 
 
 @given(probabilities)
-def test_between_the_bars_a_decision_stays_and_none_is_taken(standing: float) -> None:
+def test_decision_has_hysteresis(standing: float) -> None:
     assert (decide(Moves.UNDECIDED, standing) is Moves.STANDING) == (standing >= DECIDED)
     assert (decide(Moves.UNDECIDED, standing) is Moves.DRIVING) == (standing <= 1.0 - DECIDED)
     assert (decide(Moves.STANDING, standing) is Moves.STANDING) == (standing >= GIVEN_UP)
@@ -52,7 +52,7 @@ def test_between_the_bars_a_decision_stays_and_none_is_taken(standing: float) ->
 @given(
     st.sampled_from(Moves), probabilities, st.tuples(*2 * [st.floats(-30.0, 30.0)]), st.tuples(*2 * [st.floats(0.1, 9)])
 )
-def test_the_covariance_is_the_mixtures_about_what_is_told(
+def test_covariance_is_that_of_the_mixture_about_the_reported_velocity(
     moves: Moves, p: float, v: tuple[float, float], sigmas: tuple[float, float]
 ) -> None:
     """Its moments, from points that have the two parts' moments exactly."""
@@ -64,7 +64,7 @@ def test_the_covariance_is_the_mixtures_about_what_is_told(
     np.testing.assert_allclose(np.einsum("n,ni,nj->ij", weights, points, points), C, atol=1e-9)
 
 
-def test_who_was_just_seen_is_not_decided_on_and_its_velocity_is_pulled_to_nil() -> None:
+def test_new_vehicle_is_undecided_with_velocity_pulled_to_zero() -> None:
     new = judged(node(0.4), (6.0, 0.0), 6.0)
     assert new.moves is Moves.UNDECIDED
     assert new.standing is not None
@@ -74,14 +74,14 @@ def test_who_was_just_seen_is_not_decided_on_and_its_velocity_is_pulled_to_nil()
     assert u[0] - 2.0 * math.sqrt(C[0, 0]) < 0.0  # nor is it told to drive for sure
 
 
-def test_both_have_to_agree() -> None:
+def test_both_filters_must_agree() -> None:
     assert judged(node(0.995), (0.3, 0.0), 0.5).moves is Moves.STANDING
     assert judged(node(0.005), (9.0, 0.0), 0.5).moves is Moves.DRIVING
     assert judged(node(0.995), (9.0, 0.0), 0.5).moves is Moves.UNDECIDED
     assert judged(node(0.005), (0.0, 0.0), 0.5).moves is Moves.UNDECIDED
 
 
-def test_who_is_first_seen_far_beside_the_road_needs_more_to_be_told_to_drive() -> None:
+def test_vehicle_beside_the_road_needs_more_evidence_of_motion() -> None:
     for standing_seen, v_mps in ((0.2, 2.5), (0.4, 1.5)):
         on_road = judged(node(standing_seen), (v_mps, 0.0), 1.0)
         beside = judged(node(standing_seen, beside=True), (v_mps, 0.0), 1.0)
@@ -91,7 +91,7 @@ def test_who_is_first_seen_far_beside_the_road_needs_more_to_be_told_to_drive() 
     assert judged(node(0.005, beside=True), (9.0, 0.0), 0.5).moves is Moves.DRIVING
 
 
-def test_in_the_egos_path_a_decision_is_kept_until_the_velocity_contradicts_it() -> None:
+def test_decision_in_the_egos_path_is_kept_until_contradicted() -> None:
     creeps = judged(node(0.999, in_path=True), (1.0, 0.0), 0.5)
     assert creeps.moves is Moves.UNDECIDED
     assert creeps.standing is None
@@ -101,7 +101,7 @@ def test_in_the_egos_path_a_decision_is_kept_until_the_velocity_contradicts_it()
     assert stands.standing is None
 
 
-def test_in_the_egos_path_both_may_tell_that_it_drives() -> None:
+def test_either_filter_may_decide_in_the_egos_path() -> None:
     follows = judged(node(0.01, in_path=True), (11.0, 0.0), 0.8)
     assert follows.moves is Moves.DRIVING
     assert judged(follows, (0.5, 0.0), 0.5).moves is Moves.DRIVING  # it creeps
@@ -110,7 +110,7 @@ def test_in_the_egos_path_both_may_tell_that_it_drives() -> None:
 
 
 @pytest.mark.parametrize("vehicle", [node(None), VehicleNode(1, seen_ns=6, standing_seen=0.999)])
-def test_who_is_not_seen_or_not_spoken_of_is_not_judged(vehicle: VehicleNode) -> None:
+def test_unobserved_vehicles_are_not_decided(vehicle: VehicleNode) -> None:
     judged(vehicle, (0.0, 0.0), 0.5)
     assert vehicle.moves is Moves.UNDECIDED
     assert vehicle.standing is None
@@ -158,7 +158,7 @@ def test_planners_see_the_status() -> None:
     assert {v.moves for v in as_published} == {Moves.UNDECIDED}
 
 
-def test_an_error_of_the_size_is_not_averaged_away() -> None:
+def test_size_error_does_not_average_out() -> None:
     """Vehicles that are all off by their sizes' errors, in each frame alike, and the velocities that come of it."""
     rng, sigma, frames = np.random.default_rng(3), 0.06, 25
     off = sigma * rng.standard_normal(30)
@@ -209,7 +209,7 @@ def ego_that_drove(speed_mps: float, seconds: float = 1.0) -> StandstillDetector
 
 
 @given(st.floats(0.05, 20.0))
-def test_a_stop_is_told_once_the_last_speed_would_have_shown(speed_mps: float) -> None:
+def test_stop_is_reported_after_the_time_to_observe_it(speed_mps: float) -> None:
     standing, sigmas_m = ego_that_drove(speed_mps), []
     while (sigma_m := standing.add_unmoved(DT_S)) and len(sigmas_m) < 100:
         sigmas_m.append(sigma_m)
@@ -221,7 +221,7 @@ def test_a_stop_is_told_once_the_last_speed_would_have_shown(speed_mps: float) -
     assert standing.add_unmoved(DT_S) == 0.0
 
 
-def test_what_was_not_seen_to_move_is_made_up_for_by_the_next_motion() -> None:
+def test_unobserved_motion_is_recovered_by_the_next_motion() -> None:
     standing, speed_mps = ego_that_drove(0.2), 0.2
     covered = [standing.add_unmoved(DT_S) for _ in range(4)]
     over_s, earlier_m = standing.add_motion(np.full(20, 0.3), 5 * speed_mps * DT_S, DT_S)
@@ -230,5 +230,5 @@ def test_what_was_not_seen_to_move_is_made_up_for_by_the_next_motion() -> None:
     assert earlier_m == pytest.approx(4 * speed_mps * DT_S)
 
 
-def test_an_ego_that_never_moved_stands_at_once() -> None:
+def test_initially_stationary_ego_is_stationary_at_once() -> None:
     assert StandstillDetector(KITTI, ZeroVelocityConfig(), StillnessConfig(), 8).add_unmoved(DT_S) == 0.0

@@ -1,4 +1,4 @@
-"""The road under an ego that stands: held as it was, and known no better than the sizes of the cars before it say."""
+"""The road under a stationary ego: held, with a covariance that follows from the sizes of the cars ahead."""
 
 import math
 
@@ -48,7 +48,7 @@ def see(
     return np.exp(depths.log_depth), np.sqrt(depths.variance)
 
 
-def test_a_halted_car_keeps_the_road_that_it_halted_on() -> None:
+def test_stopped_ego_keeps_its_road() -> None:
     """With cars in sight, and for a minute without any."""
     pitch_rad, ground_size = 0.02, GroundSizeFilter(CAMERA, CONFIG)
     for k in range(40):
@@ -68,7 +68,7 @@ def test_a_halted_car_keeps_the_road_that_it_halted_on() -> None:
     assert ground_size.sigma_pitch_rad == pytest.approx(held[1], rel=1e-6)
 
 
-def test_what_is_known_of_the_road_is_forgotten_over_the_way_and_without_a_step_at_rest() -> None:
+def test_road_information_decays_with_distance_only() -> None:
     left = []
     for speed_mps in (0.0, 0.1, 1.0, 3.0, 10.0, 30.0):
         ground_size = GroundSizeFilter(CAMERA, CONFIG)
@@ -82,7 +82,7 @@ def test_what_is_known_of_the_road_is_forgotten_over_the_way_and_without_a_step_
     assert left[-1] == pytest.approx(math.exp(-1.0), rel=0.01)  # its memory is 5 s of driving
 
 
-def test_the_same_image_again_tells_no_more_of_road_and_sizes_than_once() -> None:
+def test_repeated_image_adds_no_information() -> None:
     ground_size = GroundSizeFilter(CAMERA, CONFIG)
     boxes = [box_px(x, y, 1.53, 0.01) for x, y in CARS_M]
     see(ground_size, boxes, 0.0)
@@ -97,7 +97,7 @@ def test_the_same_image_again_tells_no_more_of_road_and_sizes_than_once() -> Non
     assert passing.sigma_pitch_rad < 0.85 * once_rad  # who drives by shows a new view of itself in each frame
 
 
-def test_road_and_sizes_before_an_ego_that_stands_are_known_as_well_as_so_many_sizes_tell() -> None:
+def test_information_while_stationary_is_limited_by_the_number_of_cars() -> None:
     config = GroundSizeConfig(roof_reach_rel=0.0, sigma_kerb_m=1e-6, sigma_crown_rad=0.0)
     sigma_size = (CAR.sigma_height_rel**-2 + CAR.sigma_width_rel**-2) ** -0.5
     for cars_m in (CARS_M[:1], CARS_M[2:], CARS_M):
@@ -111,7 +111,7 @@ def test_road_and_sizes_before_an_ego_that_stands_are_known_as_well_as_so_many_s
 
 
 @pytest.mark.slow  # many seeds
-def test_who_begins_standing_is_as_sure_of_road_and_depths_as_it_says() -> None:
+def test_initially_stationary_ego_is_consistent() -> None:
     """Over seeds: cars of unknown sizes on a road of unknown pitch, whose boxes err alike in all frames."""
     of_pitch, of_depth = [], []
     for seed in range(40):
@@ -130,7 +130,7 @@ def test_who_begins_standing_is_as_sure_of_road_and_depths_as_it_says() -> None:
     assert 0.6 < np.sqrt(np.mean(np.square(of_depth))) < 1.3
 
 
-def test_a_pitch_by_the_images_is_no_news_while_the_ego_stands() -> None:
+def test_image_pitch_adds_nothing_while_stationary() -> None:
     ground_size = GroundSizeFilter(CAMERA, CONFIG)
     ground_size.predict(PERIOD_S, 0.0, GroundPlane(CAMERA.height_m, 0.01), np.eye(2) * 0.003**2, 1.0)
     before = ground_size.ground.pitch_rad, ground_size.sigma_pitch_rad
@@ -141,7 +141,7 @@ def test_a_pitch_by_the_images_is_no_news_while_the_ego_stands() -> None:
     assert (ground_size.ground.pitch_rad, ground_size.sigma_pitch_rad) == pytest.approx(before, rel=1e-3)
 
 
-def test_the_front_end_holds_the_road_of_a_halted_ego_until_cars_come() -> None:
+def test_front_end_holds_the_road_of_a_stopped_ego() -> None:
     """It drives up to cars on a road that the camera is not calibrated for, halts, and they leave."""
     frames, stands_from, pitch_rad = 120, 40, 0.02
     poses = np.tile(np.eye(4), (frames, 1, 1))

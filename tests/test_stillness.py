@@ -1,4 +1,4 @@
-"""A standstill needs positive evidence: what has not moved may be on the windscreen."""
+"""A standstill needs positive evidence: static features may be on the windscreen."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def watched(
 
 @pytest.mark.parametrize("rate_hz", [5.0, 10.0, 30.0])
 @pytest.mark.parametrize("drops", [0, 500])
-def test_a_car_that_stands_is_told_after_a_second_and_not_before(rate_hz: float, drops: int) -> None:
+def test_standstill_is_reported_after_one_second(rate_hz: float, drops: int) -> None:
     stillness, proven = watched(0.0, rate_hz, 20.0, drops, drift=0.02)
     assert not stillness.is_contradicted
     first = proven.index(True) / rate_hz
@@ -77,26 +77,26 @@ def test_a_car_that_stands_is_told_after_a_second_and_not_before(rate_hz: float,
 
 @pytest.mark.parametrize("speed_mps", [0.5, 3.0, 28.0])
 @pytest.mark.parametrize("contrast_grey", [8.0, 20.0])
-def test_a_car_that_drives_behind_drops_is_not_said_to_stand(speed_mps: float, contrast_grey: float) -> None:
+def test_moving_car_behind_drops_is_not_stationary(speed_mps: float, contrast_grey: float) -> None:
     """At 28 m/s each image of the road is another one: a second changes it no more than a tenth does."""
     stillness, proven = watched(speed_mps, 10.0, contrast_grey, 500)
     assert stillness.is_contradicted
     assert not any(proven)
 
 
-def test_a_slow_change_says_that_the_car_moves() -> None:
+def test_slow_change_means_motion() -> None:
     stillness, proven = watched(0.12, 30.0, 20.0, 500)
     assert stillness.is_contradicted
     assert not any(proven)
 
 
-def test_a_road_that_shows_nothing_tells_nothing() -> None:
+def test_featureless_road_gives_no_evidence() -> None:
     stillness, proven = watched(0.0, 10.0, 0.0, 0)
     assert not stillness.is_contradicted
     assert not any(proven)
 
 
-def test_vehicles_are_no_road_and_a_view_full_of_them_tells_nothing() -> None:
+def test_vehicles_give_no_evidence() -> None:
     rng = np.random.default_rng(3)
     aside, everything = np.array([[200.0, 60.0, 384.0, 216.0]]), np.array([[0.0, 0.0, 384.0, 216.0]])
     for boxes_px, tells in ((aside, True), (everything, False)):
@@ -118,7 +118,7 @@ def _drive(speed_mps: float, contrast_grey: float, seconds: float, rate_hz: floa
     return out
 
 
-def test_a_drive_that_begins_behind_rain_is_no_standstill_and_is_not_valid() -> None:
+def test_start_behind_rain_is_invalid_and_not_a_standstill() -> None:
     motions = _drive(24.0, 8.0, 2.5)
     assert not any(motion.standstill for motion in motions)
     assert all(Status.SCALE_INVALID in motion.status for motion in motions)
@@ -127,7 +127,7 @@ def test_a_drive_that_begins_behind_rain_is_no_standstill_and_is_not_valid() -> 
     assert held[5].cov[0, 0] > held[0].cov[0, 0]  # the longer it is held, the less it is known
 
 
-def test_a_stop_behind_rain_is_found_within_a_second_and_a_half() -> None:
+def test_stop_behind_rain_is_found_within_1_5_s() -> None:
     motions = _drive(0.0, 20.0, 2.0)
     stands = [motion.standstill for motion in motions]
     assert not any(stands[:16])
@@ -146,7 +146,7 @@ def _noisy(speed_mps: float, contrast_grey: float, noise_grey: float, grain: boo
     return stillness
 
 
-def test_a_stop_on_faint_road_is_seen_through_noise() -> None:
+def test_stop_on_weak_texture_is_found_in_noise() -> None:
     """Noise alone changes a faint road's image by more than a seventh of its contrast: no motion is in that."""
     stillness = _noisy(0.0, 5.0, 1.1)
     changes = stillness.changes
@@ -156,6 +156,6 @@ def test_a_stop_on_faint_road_is_seen_through_noise() -> None:
 
 
 @pytest.mark.parametrize("speed_mps", [0.3, 3.0, 20.0])
-def test_noise_makes_no_stop(speed_mps: float) -> None:
+def test_noise_is_not_a_standstill(speed_mps: float) -> None:
     assert not _noisy(speed_mps, 5.0, 1.1).is_proven
     assert not _noisy(speed_mps, 5.0, 1.0, grain=True).is_proven

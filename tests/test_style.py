@@ -1,4 +1,4 @@
-"""The text that people read: words and names that the style guide in CONTRIBUTING.md replaces do not come back."""
+"""Style of texts: words and names that CONTRIBUTING.md's style guide replaces must not appear."""
 
 from __future__ import annotations
 
@@ -63,22 +63,22 @@ def findings(path: Path, lines: Iterator[tuple[int, str]], patterns: dict[str, s
     ]
 
 
-def test_pages_use_the_words_of_the_field() -> None:
+def test_pages_use_standard_terms() -> None:
     wrong = [one for path in PAGES for one in findings(path, enumerate(path.read_text().splitlines(), 1), PHRASES)]
     assert not wrong, "\n".join(wrong)
 
 
-def test_comments_and_messages_use_the_words_of_the_field() -> None:
+def test_comments_and_messages_use_standard_terms() -> None:
     wrong = [one for path in CODE for one in findings(path, texts(path), PHRASES)]
     assert not wrong, "\n".join(wrong)
 
 
-def test_names_use_the_words_of_the_field() -> None:
+def test_names_use_standard_terms() -> None:
     wrong = sorted({one for path in CODE for one in findings(path, identifiers(path), NAMES)})
     assert not wrong, "\n".join(wrong)
 
 
-def test_the_check_finds_what_it_is_for(tmp_path: Path) -> None:
+def test_check_finds_known_violations(tmp_path: Path) -> None:
     module = tmp_path / "module.py"
     module.write_text('LEAST_M = 1.0  # begins anew\n"""Who stands is told."""\n')
     assert [number for number, line in texts(module) if any(re.search(p, line, re.I) for p in PHRASES)] == [1, 2]

@@ -76,7 +76,7 @@ def row(text: str, name: str) -> str:
     return next(line for line in text.splitlines() if line.startswith(f"{name} "))
 
 
-def test_the_table_says_how_every_node_is(vehicle: Path) -> None:
+def test_table_has_the_state_of_every_node(vehicle: Path) -> None:
     with Bus("car", f"top-{os.getpid()}", runtime_dir=vehicle) as bus:
         watch = VehicleTable(bus)
         watch.wait(LIMIT_S)
@@ -104,7 +104,7 @@ def test_once_prints_one_table_without_control_characters(vehicle: Path) -> None
     assert len(out.getvalue().splitlines()) == 7
 
 
-def test_without_a_vehicle_it_says_so(tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_missing_vehicle_is_reported(tmp_path_factory: pytest.TempPathFactory) -> None:
     out = io.StringIO()
     assert top("car", tmp_path_factory.mktemp("n"), once=True, out=out) == 1
     assert "car: no estimate" in out.getvalue()

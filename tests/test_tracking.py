@@ -1,4 +1,4 @@
-"""Ids that last: vehicles of a known world through the tracker, with gaps, flicker and false alarms."""
+"""Stable ids: vehicles of a known world through the tracker, with gaps, flicker and false alarms."""
 
 import math
 from itertools import pairwise
@@ -70,7 +70,7 @@ def test_parked_cars_keep_their_ids_and_places_as_the_ego_passes() -> None:
         assert abs(wrap(poses[-1].yaw_rad)) < 0.2  # it stands, so it keeps the road's direction
 
 
-def test_what_stands_is_looked_for_where_it_stood_and_what_drives_where_it_drives() -> None:
+def test_prediction_depends_on_the_motion_state() -> None:
     """(places' 1-sigma, speed) of a parked car and of one that drives, without and with what standing says."""
     found = {}
     for sigma_mps in (1e3, TrackingConfig().sigma_standing_mps):
@@ -98,7 +98,7 @@ def test_a_gap_shorter_than_forget_s_keeps_the_id() -> None:
     assert ids == {0}
 
 
-def test_after_a_gap_a_car_that_stands_takes_no_box_of_the_one_beside_it() -> None:
+def test_stationary_car_takes_no_neighbouring_box_after_a_gap() -> None:
     drive, near, tracks = Drive(noise_px=0.3), SE2(60.0, -4.0, 0.0), list[Track]()
     for k in range(22):
         tracks = drive.step(SE2(0.6 * k, 0.0, 0.0), [near])
@@ -118,7 +118,7 @@ def test_a_gap_longer_than_forget_s_gives_a_new_id() -> None:
     assert ids == {0, 1}
 
 
-def test_an_oncoming_car_turns_to_where_it_goes() -> None:
+def test_heading_of_an_oncoming_car_follows_its_motion() -> None:
     drive = Drive(noise_px=0.3)
     tracks: list[Track] = []
     for k in range(15):
@@ -140,7 +140,7 @@ def test_crossing_cars_do_not_swap_ids() -> None:
         assert np.ptp(depths) < 4.0
 
 
-def test_labels_are_voted_and_false_alarms_get_no_id() -> None:
+def test_labels_are_voted_and_false_alarms_have_no_id() -> None:
     drive = Drive()
     for k in range(12):
         tracks = drive.step(SE2(), [SE2(15.0, 0.0, 0.0)], ["truck" if k % 4 == 1 else "car"])
@@ -151,7 +151,7 @@ def test_labels_are_voted_and_false_alarms_get_no_id() -> None:
     assert tracks[0].vehicle == 0
 
 
-def test_a_car_that_one_box_calls_a_truck_stays_as_large_and_where_it_is() -> None:
+def test_single_truck_label_changes_neither_size_nor_position() -> None:
     drive, car = Drive(), [SE2(20.0, 0.0, 0.0)]
     for _ in range(6):
         tracks = drive.step(SE2(), car)
@@ -163,7 +163,7 @@ def test_a_car_that_one_box_calls_a_truck_stays_as_large_and_where_it_is() -> No
     assert drive.ground_size.size(0)[1] == pytest.approx(width, rel=0.02)
 
 
-def test_a_car_that_was_first_called_a_truck_gets_the_prior_of_a_car() -> None:
+def test_corrected_label_changes_the_size_prior() -> None:
     ways = [["car"] * 8, ["truck", *["car"] * 7]]
     heights, outlines = [], []
     for labels in ways:
@@ -177,7 +177,7 @@ def test_a_car_that_was_first_called_a_truck_gets_the_prior_of_a_car() -> None:
     assert outlines[1] == pytest.approx(outlines[0], rel=0.05)
 
 
-def test_a_place_by_depth_counts_by_its_covariance() -> None:
+def test_position_from_depth_is_weighted_by_covariance() -> None:
     def after(sigma_m: float | None) -> tuple[float, float]:
         drive = Drive()
         tracks: list[Track] = []
@@ -203,7 +203,7 @@ def test_a_place_by_depth_counts_by_its_covariance() -> None:
     assert after(1e3) == pytest.approx((alone_m, alone_var), rel=1e-3)
 
 
-def test_what_stands_by_its_parallax_keeps_its_yaw_while_its_size_is_learned() -> None:
+def test_stationary_vehicle_keeps_its_yaw_while_size_is_estimated() -> None:
     drive = Drive(noise_px=0.3)
     tracks: list[Track] = []
     for k in range(45):
@@ -215,7 +215,7 @@ def test_what_stands_by_its_parallax_keeps_its_yaw_while_its_size_is_learned() -
     assert math.hypot(track.state[0] - 65.0, track.state[1] - 4.0) < 1.0
 
 
-def test_a_vehicle_of_no_usual_size_keeps_its_id_while_its_size_is_learned() -> None:
+def test_unusual_size_keeps_its_id_while_size_is_estimated() -> None:
     drive = Drive(noise_px=0.3)
     ids, errors = set(), []
     for k in range(50):
@@ -256,7 +256,7 @@ class Looks:
 
 
 @pytest.mark.parametrize("yaw_rad", [0.3, -1.2, 2.8, math.pi])
-def test_a_car_that_never_moved_faces_as_it_looks(yaw_rad: float) -> None:
+def test_heading_of_a_never_moving_car_is_the_observed_one(yaw_rad: float) -> None:
     looks, track = Looks(), None
     rng = np.random.default_rng(0)
     for _ in range(30):
@@ -267,7 +267,7 @@ def test_a_car_that_never_moved_faces_as_it_looks(yaw_rad: float) -> None:
     assert track.sigma_yaw_rad < 0.15
 
 
-def test_a_front_that_is_mostly_taken_for_the_rear_turns_once_and_the_axis_stays() -> None:
+def test_consistently_reversed_front_turns_once() -> None:
     looks, yaws = Looks(), []
     for k in range(40):
         track = looks.see(SE2(14.0, 1.0, 0.2), 0.2 if k % 4 else wrap(0.2 + math.pi), flip=0.2)  # the first is wrong
@@ -279,7 +279,7 @@ def test_a_front_that_is_mostly_taken_for_the_rear_turns_once_and_the_axis_stays
     assert abs(wrap(yaws[-1] - 0.2)) < 0.05
 
 
-def test_an_axis_alone_leaves_a_car_headed_like_the_ego() -> None:
+def test_axis_without_front_keeps_the_ego_heading() -> None:
     looks, track = Looks(), None
     for _ in range(5):
         track = looks.see(SE2(14.0, 1.0, 0.0), 1.0, flip=0.5)
@@ -288,7 +288,7 @@ def test_an_axis_alone_leaves_a_car_headed_like_the_ego() -> None:
     assert not track.is_yaw_known
 
 
-def test_motion_says_which_end_is_the_front() -> None:
+def test_motion_determines_the_front() -> None:
     looks, track = Looks(), None
     for k in range(25):
         track = looks.see(SE2(40.0 - 1.0 * k, 3.0, math.pi), 0.05, flip=0.3)  # it comes, and looks as if it went
@@ -297,7 +297,7 @@ def test_motion_says_which_end_is_the_front() -> None:
 
 
 @pytest.mark.parametrize("label", ["bus", "car"])
-def test_a_car_is_not_taken_for_what_is_seen_behind_it(label: str) -> None:
+def test_car_is_not_associated_with_objects_behind_it(label: str) -> None:
     """A detector that for a moment draws a bus about a car, 1.7 times as high: no car grows so from frame to frame."""
     drive = Drive()
     ego, car = SE2(), SE2(30.0, 0.5, 0.0)
@@ -316,7 +316,7 @@ def test_a_car_is_not_taken_for_what_is_seen_behind_it(label: str) -> None:
     assert again.pose().x_m == pytest.approx(before_m, abs=1.0)  # the road learns of the odd boxes too
 
 
-def test_each_filter_has_a_row_for_each_track_and_no_other() -> None:
+def test_each_filter_has_exactly_one_row_per_track() -> None:
     """Cars come and go in any order: whether one stands stays with it."""
     drive = Drive(noise_px=0.3)
     tall = SE2(70.0, -8.0)
@@ -331,7 +331,7 @@ def test_each_filter_has_a_row_for_each_track_and_no_other() -> None:
                 assert track.place.assumed.standing == tracker.placing.parallax.stationary_probability(row)
 
 
-def test_a_car_that_is_lost_leaves_no_id_to_the_parked_one_beside() -> None:
+def test_lost_car_does_not_pass_its_id_to_a_parked_one() -> None:
     """The nearer car of a row is missed for good: the farther one's box, which overlaps its own, is another car's."""
     drive = Drive()
     near, far = SE2(20.0, -4.0), SE2(21.5, -5.6)
@@ -341,7 +341,7 @@ def test_a_car_that_is_lost_leaves_no_id_to_the_parked_one_beside() -> None:
     assert known != others
 
 
-def test_no_car_gives_its_box_away_so_that_its_neighbour_gets_one() -> None:
+def test_association_does_not_shift_boxes_to_neighbours() -> None:
     """A box is lost at the end of a row where each box overlaps its neighbour's: the others keep their own."""
     drive = Drive()
     row = [SE2(30.0 + 1.5 * i, -2.0 - 0.8 * i) for i in range(3)]
@@ -355,7 +355,7 @@ def test_no_car_gives_its_box_away_so_that_its_neighbour_gets_one() -> None:
 
 
 @pytest.mark.parametrize("left", [-1.0, 1.0])
-def test_a_car_that_the_image_cuts_off_is_expected_to_reach_its_border(left: float) -> None:
+def test_truncated_car_is_predicted_to_reach_the_border(left: float) -> None:
     drive = Drive()
     tracks = [track for k in range(12) for track in drive.step(SE2(0.8 * k, 0.0), [SE2(16.0, 3.0 * left)])]
     track = tracks[-1]

@@ -42,13 +42,13 @@ def test_perfect_tracks_score_one() -> None:
     assert hota(frames) == pytest.approx(1.0)
 
 
-def test_a_switched_id_costs_association_alone() -> None:
+def test_switched_id_lowers_only_association() -> None:
     frames = [exact([1], [10]) for _ in range(5)] + [exact([1], [20]) for _ in range(5)]
     # DetA 1; each true positive's association is 5 / (10 + 5 - 5)
     assert hota(frames) == pytest.approx(math.sqrt(0.5))
 
 
-def test_misses_and_false_alarms_cost_detection() -> None:
+def test_misses_and_false_alarms_lower_detection() -> None:
     missed = [exact([1], [10]) for _ in range(5)] + [exact([1], []) for _ in range(5)]
     assert hota(missed) == pytest.approx(math.sqrt(0.5 * 0.5))
     alarms = [exact([1], [10]) for _ in range(5)] + [exact([], [99]) for _ in range(5)]

@@ -1,4 +1,4 @@
-"""Laws of the passage between ego and camera poses, and of the files."""
+"""Conversion between ego and camera poses, and trajectory files."""
 
 from __future__ import annotations
 
@@ -64,13 +64,13 @@ def test_positive_pitch_is_nose_down_and_positive_roll_right_side_down() -> None
 
 
 @given(planar, attitudes, mounts)
-def test_the_inverse_undoes_a_pose(T_world_ego: SE2, attitude: Attitude, mount: GroundPlane) -> None:
+def test_inverse_of_a_pose(T_world_ego: SE2, attitude: Attitude, mount: GroundPlane) -> None:
     T = ego_pose(T_world_ego, attitude) @ mount_pose(mount)
     assert inverse(T) @ T == pytest.approx(np.eye(4), abs=1e-8)
 
 
 @given(mounts, st.integers(0, 1000))
-def test_whatever_the_mount_the_camera_moves_as_it_did(mount: GroundPlane, seed: int) -> None:
+def test_camera_motion_does_not_depend_on_the_mount(mount: GroundPlane, seed: int) -> None:
     moved = random_poses(20, seed)
     T_ego_cam = mount_pose(mount)
     trajectory = CameraTrajectory(mount)
@@ -79,7 +79,7 @@ def test_whatever_the_mount_the_camera_moves_as_it_did(mount: GroundPlane, seed:
         assert trajectory.add(0, T_world_ego) == pytest.approx(T_first_i, abs=1e-9)
 
 
-def test_driving_on_with_a_camera_that_looks_down_climbs_in_its_axes() -> None:
+def test_forward_motion_of_a_pitched_camera_climbs_in_its_axes() -> None:
     """KITTI 00 gains 3.2 m over 92 m in camera axes for this reason."""
     trajectory = CameraTrajectory(GroundPlane(1.65, pitch_rad=math.radians(2.0)))
     trajectory.add(0, ego_pose(SE2(), Attitude()))
@@ -89,7 +89,7 @@ def test_driving_on_with_a_camera_that_looks_down_climbs_in_its_axes() -> None:
     )
 
 
-def test_a_new_epoch_goes_on_from_the_last_pose() -> None:
+def test_new_epoch_continues_at_last_pose() -> None:
     trajectory = CameraTrajectory(GroundPlane(1.65, 0.02, 0.01))
     trajectory.add(0, ego_pose(SE2(), Attitude()))
     last = trajectory.add(0, ego_pose(SE2(10.0, 1.0, 0.3), Attitude()))
@@ -101,7 +101,7 @@ def test_a_new_epoch_goes_on_from_the_last_pose() -> None:
     assert step == pytest.approx(alone.add(0, ego_pose(SE2(1.0, 0.0, 0.1), Attitude())), abs=1e-12)
 
 
-def test_files_come_back(tmp_path: Path) -> None:
+def test_files_round_trip(tmp_path: Path) -> None:
     poses = random_poses(30, 4)
     kitti, tum = tmp_path / "a.txt", tmp_path / "b.txt"
     kitti.write_text("".join(kitti_row(T) + "\n" for T in poses))

@@ -1,4 +1,4 @@
-"""The records check themselves, and an older reader lives with a newer sender."""
+"""Records validate themselves, and an older reader accepts a newer sender."""
 
 import math
 from collections.abc import Iterator
@@ -34,7 +34,7 @@ def test_a_status_of_a_newer_sender_is_unknown_not_an_error() -> None:
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_numbers_that_are_none_are_refused(bad: float) -> None:
+def test_non_finite_numbers_are_refused(bad: float) -> None:
     with pytest.raises(ValueError, match="finite"):
         EgoEdge(from_frame=0, to_frame=1, T_from_to=SE2(), cov=(*EYE3[:8], bad))
     with pytest.raises(ValueError, match="finite"):

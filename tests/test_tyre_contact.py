@@ -64,16 +64,14 @@ def test_the_face_of_a_body_on_tyres_is_found_at_any_yaw(
 
 
 @given(ends, yaws, heights)
-def test_the_face_is_never_behind_the_tyre_and_never_more_than_the_overhang_before_it(
-    face_m: float, yaw_rad: float, height_m: float
-) -> None:
+def test_face_is_within_the_overhang_before_the_tyre(face_m: float, yaw_rad: float, height_m: float) -> None:
     found = bottom_at_face(seen(height_m / face_m), yaw_rad, height_m, CONFIG)
     nearer_m = face_m - height_m / found.slope_bottom
     assert -1e-9 <= nearer_m <= CONFIG.overhang_rel * CAR.length_m + 1e-9
 
 
 @given(ends, yaws, heights)
-def test_the_sigma_goes_with_the_slope(face_m: float, yaw_rad: float, height_m: float) -> None:
+def test_sigma_scales_with_the_slope(face_m: float, yaw_rad: float, height_m: float) -> None:
     slope, step = height_m / face_m, 1e-7
     low, here, high = (bottom_at_face(seen(s), yaw_rad, height_m, CONFIG) for s in (slope - step, slope, slope + step))
     derivative = (high.slope_bottom - low.slope_bottom) / (2.0 * step)
@@ -82,23 +80,23 @@ def test_the_sigma_goes_with_the_slope(face_m: float, yaw_rad: float, height_m: 
 
 
 @given(ends, yaws)
-def test_a_box_of_the_body_stays_as_it_is(face_m: float, yaw_rad: float) -> None:
+def test_box_of_the_body_is_not_changed(face_m: float, yaw_rad: float) -> None:
     of_body = seen(CAMERA.height_m / face_m, lower_edge="body")
     assert bottom_at_face(of_body, yaw_rad, CAMERA.height_m, CONFIG) is of_body
 
 
 @given(ends, yaws)
-def test_it_is_done_once(face_m: float, yaw_rad: float) -> None:
+def test_correction_is_applied_once(face_m: float, yaw_rad: float) -> None:
     once = bottom_at_face(seen(CAMERA.height_m / face_m), yaw_rad, CAMERA.height_m, CONFIG)
     assert bottom_at_face(once, yaw_rad, CAMERA.height_m, CONFIG) is once
 
 
-def test_a_lower_edge_over_the_horizon_stays_as_it_is() -> None:
+def test_lower_edge_above_the_horizon_is_not_changed() -> None:
     above = seen(-0.01)
     assert bottom_at_face(above, 0.0, CAMERA.height_m, CONFIG) is above
 
 
-def test_a_car_is_placed_alike_whether_its_box_ends_at_the_body_or_at_the_tyres() -> None:
+def test_position_does_not_depend_on_the_lower_edge_type() -> None:
     face_m, found = 9.0, {}
     for lower_edge in ("body", "tyres"):
         ground_size = GroundSizeFilter(CAMERA, GroundSizeConfig())

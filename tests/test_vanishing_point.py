@@ -1,4 +1,4 @@
-"""The road's lines meet on its horizon: exactly in a world without noise, robustly beside others, refused otherwise."""
+"""Road lines meet on the horizon: exact without noise, robust beside other lines, refused otherwise."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_without_noise_the_pitch_is_exact_from_a_wrong_guess(
     assert lines.sigma_rad >= CONFIG.sigma_road_rad
 
 
-def test_segments_of_other_directions_do_little() -> None:
+def test_other_directions_have_little_effect() -> None:
     """Of three segments one is no line of the road."""
     off = []
     for seed in range(60):
@@ -68,7 +68,7 @@ def test_segments_of_other_directions_do_little() -> None:
 
 
 @pytest.mark.parametrize("curvature_per_m", [0.0008, -0.0008])
-def test_in_a_sag_the_lines_meet_higher(curvature_per_m: float) -> None:
+def test_lines_meet_higher_in_a_sag(curvature_per_m: float) -> None:
     """Where they lead lies in the road at the distance that is told."""
     lines = fit_vanishing_point(CAMERA, CONFIG, segments(0.01, 0.0, curvature_per_m), 0.01, 0.0, 0.0)
     assert lines is not None
@@ -76,7 +76,7 @@ def test_in_a_sag_the_lines_meet_higher(curvature_per_m: float) -> None:
     assert abs(float(there @ lines.direction)) < lines.sigma_rad
 
 
-def test_too_few_lines_say_nothing() -> None:
+def test_too_few_lines_give_no_pitch() -> None:
     every = segments(0.01, 0.0)
     assert fit_vanishing_point(CAMERA, CONFIG, every[:0], 0.01, 0.0, 0.0) is None
     assert fit_vanishing_point(CAMERA, CONFIG, every[:3], 0.01, 0.0, 0.0) is None
@@ -97,7 +97,7 @@ def painted(pitch_rad: float) -> NDArray[np.uint8]:
     return np.asarray(cv2.resize(large, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def test_an_image_is_looked_at_every_few_metres_of_a_straight_way() -> None:
+def test_images_are_used_every_few_metres_of_straight_road() -> None:
     detector, image = VanishingPointDetector(CAMERA, CONFIG), painted(0.02)
     first = detector.detect(image, NO_BOXES, 0.0, 0.0, 0.0, 0.5)
     assert first is not None  # what a file says of the pitch may be wrong
@@ -108,11 +108,11 @@ def test_an_image_is_looked_at_every_few_metres_of_a_straight_way() -> None:
 
 
 @pytest.mark.parametrize("grey", [np.zeros((192, 640), np.uint8), np.full((192, 640), 255, np.uint8)])
-def test_an_image_without_lines_says_nothing(grey: NDArray[np.uint8]) -> None:
+def test_image_without_lines_gives_no_pitch(grey: NDArray[np.uint8]) -> None:
     assert VanishingPointDetector(CAMERA, CONFIG).detect(grey, NO_BOXES, 0.0, 0.0, 0.0, 1.0) is None
 
 
-def test_where_there_are_none_looks_are_fewer() -> None:
+def test_rate_drops_without_lines() -> None:
     detector, empty, image = VanishingPointDetector(CAMERA, CONFIG), np.full((192, 640), 90, np.uint8), painted(0.02)
     detector.detect(empty, NO_BOXES, 0.0, 0.0, 0.0, 1.0)
     assert detector.detect(image, NO_BOXES, 0.0, 0.0, 0.0, CONFIG.every_m) is None
@@ -122,7 +122,7 @@ def test_where_there_are_none_looks_are_fewer() -> None:
 
 @given(seed=st.integers(0, 1000))
 @settings(max_examples=40, deadline=None)
-def test_lines_that_meet_nowhere_are_no_roads(seed: int) -> None:
+def test_lines_without_common_point_are_rejected(seed: int) -> None:
     rng = np.random.default_rng(seed)
     start = rng.uniform([0.0, 110.0], [639.0, 190.0], (40, 2))
     every = np.stack([start, start + rng.normal(0.0, 25.0, (40, 2))], axis=1)
@@ -134,7 +134,7 @@ def test_lines_of_vehicles_do_not_count() -> None:
     assert VanishingPointDetector(CAMERA, CONFIG).detect(painted(0.02), whole, 0.0, 0.0, 0.0, 1.0) is None
 
 
-def test_the_filter_takes_the_pitch_of_lines_and_refuses_what_is_far_off() -> None:
+def test_filter_uses_pitch_of_lines_and_rejects_outliers() -> None:
     filter_ = RoadFilter(CAMERA, RoadScaleConfig())
     lines = fit_vanishing_point(CAMERA, CONFIG, segments(0.02, 0.0), 0.0, 0.0, 0.0)
     assert lines is not None

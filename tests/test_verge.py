@@ -1,4 +1,4 @@
-"""Grass is taken out of a road mask by its colour, whatever the light; grey images and roads stay as they are."""
+"""Grass is removed from a road mask by its colour in any light; grey images and roads are unchanged."""
 
 from __future__ import annotations
 
@@ -32,30 +32,30 @@ def mask(right_px: int = WIDTH_PX) -> NDArray[np.bool_]:
 
 
 @pytest.mark.parametrize("light", [(1.0, 1.0, 1.0), (0.4, 0.4, 0.4), (1.3, 1.0, 0.85), (0.8, 1.1, 1.0)])
-def test_the_verge_goes_and_the_road_stays_in_any_light(light: tuple[float, float, float]) -> None:
+def test_only_the_verge_is_removed_in_any_light(light: tuple[float, float, float]) -> None:
     left = without_verge(mask(), street(light))
     assert left[:, : VERGE_PX - SHRINK].sum() == mask(VERGE_PX - SHRINK).sum()
     assert not left[:, VERGE_PX + SHRINK :].any()
 
 
-def test_a_road_without_a_verge_stays_as_it_is() -> None:
+def test_road_without_verge_is_unchanged() -> None:
     road = mask(VERGE_PX - SHRINK)
     assert (without_verge(road, street()) == road).all()
 
 
-def test_so_it_does_in_a_grey_image_and_at_night() -> None:
+def test_grey_and_night_images_are_unchanged() -> None:
     grey = cv2.cvtColor(street(), cv2.COLOR_BGR2GRAY)
     assert (without_verge(mask(), grey) == mask()).all()
     assert (without_verge(mask(), street((0.1, 0.1, 0.1))) == mask()).all()
 
 
-def test_red_bricks_in_the_mask_make_no_grey_road_green() -> None:
+def test_red_bricks_do_not_affect_grey_road() -> None:
     image, road = street(), mask(VERGE_PX - SHRINK)
     image[HORIZON_PX:, :130] = (60, 60, 110)
     assert (without_verge(road, image) == road).all()
 
 
-def test_a_leaf_on_the_road_is_no_verge() -> None:
+def test_leaf_on_the_road_is_not_a_verge() -> None:
     image, road = street(), mask(VERGE_PX - SHRINK)
     image[HORIZON_PX + 40 : HORIZON_PX + 44, 100:104] = GRASS
     assert (without_verge(road, image) == road).all()
@@ -63,7 +63,7 @@ def test_a_leaf_on_the_road_is_no_verge() -> None:
 
 @settings(max_examples=50)
 @given(st.integers(1, 40), st.integers(1, 40), st.data())
-def test_it_only_ever_takes_away_and_bears_any_image(height_px: int, width_px: int, data: st.DataObject) -> None:
+def test_mask_only_shrinks_for_any_image(height_px: int, width_px: int, data: st.DataObject) -> None:
     image = data.draw(hnp.arrays(np.uint8, (height_px, width_px, 3)))
     road = data.draw(hnp.arrays(np.bool_, (height_px, width_px)))
     before = road.copy()

@@ -44,7 +44,7 @@ def tape(tmp_path: Path) -> Tape:
     return tape
 
 
-def test_what_is_no_recording_is_refused_before_a_page_is_served(
+def test_non_recording_file_is_refused_before_serving(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     web = SimpleNamespace(WebViewer=lambda port: pytest.fail("it serves a page"))
@@ -107,7 +107,7 @@ def test_everything_of_a_drive_is_sent(tape: Tape) -> None:
 
 @pytest.mark.processes
 @pytest.mark.skipif(importlib.util.find_spec("rerun") is not None, reason="rerun-sdk is installed")
-def test_without_rerun_it_says_what_to_install(tape: Tape) -> None:
+def test_missing_rerun_is_named(tape: Tape) -> None:
     answer = call("view", str(tape.path), "--save", str(tape.path.with_suffix(".rrd")))
     assert answer.returncode == 2
     assert "birdslam[view]" in answer.stderr
@@ -117,7 +117,7 @@ def test_without_rerun_it_says_what_to_install(tape: Tape) -> None:
 @needs_rerun
 @pytest.mark.processes
 @pytest.mark.skipif(chromium() is None, reason="no Chromium (Debian: apt install chromium)")
-def test_in_a_browser_the_viewer_begins_and_asks_nobody_elsewhere(tmp_path: Path) -> None:
+def test_viewer_starts_in_a_browser_without_other_hosts(tmp_path: Path) -> None:
     """Whatever its page asks of other hosts the policy refuses, and that alone is wrong on the console."""
     from birdslam.runtime.recording.rerun_web import POLICY, WebViewer
 

@@ -1,4 +1,4 @@
-"""Eq. 4: what the edges weigh."""
+"""Eq. 4: the weights of the edges."""
 
 import pytest
 from hypothesis import given
@@ -36,7 +36,7 @@ def test_measured_mode_keeps_the_covariances_and_leaves_out_the_trackers_predict
 
 
 @pytest.mark.parametrize("mode", ["measured", "paper"])
-def test_landmarks_past_the_threshold_are_left_out(mode: str) -> None:
+def test_landmarks_beyond_the_threshold_are_left_out(mode: str) -> None:
     m = weighted(FRAME, WeightsConfig(mode=mode, depth_threshold_m=10.0))  # type: ignore[arg-type]
     assert {e.landmark for e in m.cp} == {e.landmark for e in FRAME.cp if e.x_m <= 10.0}
     assert 0 < len(m.cp) < len(FRAME.cp)

@@ -387,7 +387,7 @@ def without_what_lacks(record: Any, plain: Any) -> Any:
 
 
 @by_name
-def test_older_messages_decode_for_ever(name: str) -> None:
+def test_older_messages_still_decode(name: str) -> None:
     """With the fields that they lack at their defaults; none has become another one since."""
     example = BY_NAME[name]
     for path in versions(name)[:-1]:
@@ -463,7 +463,7 @@ def test_no_number_may_be_other_than_finite(name: str, value: float) -> None:
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_but_what_the_car_says_of_its_speed(value: float) -> None:
+def test_only_speed_readings_may_be_non_finite(value: float) -> None:
     """A sensor that fails is no malformed message: the method judges it, and a frame bears it bit for bit."""
     for field in ("speed_mps", "sigma_mps", "yaw_rate_radps", "yaw_rate_sigma_radps"):
         reading = msgspec.structs.replace(_READING, **{field: value})
@@ -495,13 +495,13 @@ def test_but_what_the_car_says_of_its_speed(value: float) -> None:
         (encode(BY_NAME["Estimate"]) + b"\x00", "extra data"),
     ],
 )
-def test_the_reason_is_said(data: bytes, reason: str) -> None:
+def test_reason_is_in_the_message(data: bytes, reason: str) -> None:
     with pytest.raises(WireError, match=reason) as caught:
         decode(data, Estimate)
     assert "Estimate" in str(caught.value)
 
 
-def test_what_is_not_finite_is_never_sent() -> None:
+def test_non_finite_numbers_are_never_sent() -> None:
     """Not even from a record that does not check itself."""
 
     class Unchecked(msgspec.Struct):
@@ -511,7 +511,7 @@ def test_what_is_not_finite_is_never_sent() -> None:
         encode(Unchecked(math.nan))
 
 
-def test_bytes_that_only_look_like_another_number_are_taken() -> None:
+def test_bytes_that_resemble_nan_are_accepted() -> None:
     """The quick look at the bytes errs on the careful side alone."""
     (looks_so,) = struct.unpack(">d", b"\x3f\xcb\x7f\xf8\xcb\xff\xff\x00")
     for height_m in (looks_so, 1.7e308, -1.7e308, 5e-324):
@@ -519,7 +519,7 @@ def test_bytes_that_only_look_like_another_number_are_taken() -> None:
 
 
 @given(st.lists(st.floats(), max_size=12), st.integers(0, 3))
-def test_what_is_not_finite_is_seen_among_any_bytes(numbers: list[float], times: int) -> None:
+def test_non_finite_numbers_are_detected_in_any_bytes(numbers: list[float], times: int) -> None:
     class Unchecked(msgspec.Struct):
         x_m: list[float]
 
@@ -531,7 +531,7 @@ def test_what_is_not_finite_is_seen_among_any_bytes(numbers: list[float], times:
             encode(record)
 
 
-def test_numbers_are_not_looked_at_one_by_one() -> None:
+def test_finite_check_is_vectorized() -> None:
     """For a record of thousands of numbers that was three quarters of the time it takes to encode it."""
     estimate = BY_NAME["Estimate"]
     crowded = msgspec.structs.replace(estimate, people=estimate.people * 100)
@@ -610,7 +610,7 @@ def estimates(draw: st.DrawFn) -> Estimate:
 
 
 @given(estimates())
-def test_an_estimate_comes_back_as_it_was(estimate: Estimate) -> None:
+def test_estimate_round_trips(estimate: Estimate) -> None:
     data = encode(estimate)
     again = decode(data, Estimate)
     assert again == estimate
@@ -731,7 +731,7 @@ for _ in range(60):  # types that nobody has decoded yet; without the lock one i
 
 
 @pytest.mark.processes
-def test_threads_that_decode_a_new_record_at_once_end_no_process() -> None:
+def test_concurrent_first_decoding_is_safe() -> None:
     """msgspec looks at a type's fields when it is first asked for it, and crashes where two threads ask at once."""
     done = subprocess.run([sys.executable, "-c", FOUR_AT_ONCE], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

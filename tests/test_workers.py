@@ -1,4 +1,4 @@
-"""The pool of worker processes: workers end with their parent, however that ends."""
+"""The pool of worker processes: workers end with their parent in any case."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Films with more pixels than the ego-motion asks for are made smaller, and pixels find their way back."""
+"""Large films are downscaled for the ego-motion, and pixels are converted back."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def camera(focal_px: float, width_px: int = 1920, height_px: int = 1080) -> Came
 
 
 @pytest.mark.parametrize("focal_px", [MAX_FOCAL_PX, MIN_FOCAL_PX, MIN_UPSCALED_FOCAL_PX - 1.0])
-def test_a_film_that_suits_it_stays_as_it_is(focal_px: float) -> None:
+def test_suitable_film_is_not_scaled(focal_px: float) -> None:
     given_camera = camera(focal_px)
     resolution = WorkingResolution(given_camera)
     image, boxes = np.zeros((1080, 1920), np.uint8), np.ones((2, 4))
@@ -47,7 +47,7 @@ def test_a_pixel_is_the_same_ray_at_both_resolutions(focal_px: float, u: float, 
     assert 0.5 * (resolution.camera.fx_px + resolution.camera.fy_px) == pytest.approx(FOCAL_PX, rel=0.01)
 
 
-def test_an_image_keeps_where_its_parts_are() -> None:
+def test_scaled_image_keeps_relative_positions() -> None:
     resolution = WorkingResolution(camera(1440.0))
     image = np.zeros((1080, 1920), np.uint8)
     image[400:440, 800:840] = 200
@@ -62,7 +62,7 @@ def test_an_image_keeps_where_its_parts_are() -> None:
         resolution.image(np.zeros((360, 640), np.uint8))
 
 
-def test_the_odometry_gives_pixels_of_the_images_that_it_is_given() -> None:
+def test_odometry_gives_pixels_of_its_input_images() -> None:
     """A plane of texture, larger than the working resolution: corners lie where the texture is."""
     large = camera(1440.0)
     odometry = Odometry(large)

@@ -1,4 +1,4 @@
-"""The built-in world: its truth is exact, its drives are continuous, the same seed gives the same bytes."""
+"""The built-in world: exact truth, continuous drives, deterministic by seed."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def test_the_box_in_space_projects_onto_the_box_in_the_image(level: list[WorldFr
     assert checked > 20
 
 
-def test_pixels_visibility_and_truncation_belong_together(frames: list[WorldFrame]) -> None:
+def test_pixels_visibility_and_truncation_are_consistent(frames: list[WorldFrame]) -> None:
     seen = 0
     for frame in frames:
         for body in frame.objects:
@@ -127,7 +127,7 @@ def test_pixels_visibility_and_truncation_belong_together(frames: list[WorldFram
     assert seen > 30
 
 
-def test_a_body_that_nothing_hides_fills_the_pixels_that_it_would_alone(frames: list[WorldFrame]) -> None:
+def test_unoccluded_body_has_full_visibility(frames: list[WorldFrame]) -> None:
     """Its visible share is that of samples; a body with all of them seen has pixels all over its box's middle."""
     for frame in frames:
         for body in frame.objects:
@@ -137,7 +137,7 @@ def test_a_body_that_nothing_hides_fills_the_pixels_that_it_would_alone(frames: 
                 assert frame.instances[v, u] == body.object_id + 1
 
 
-def test_solid_lines_lie_on_lane_pixels_where_nothing_hides_them(level: list[WorldFrame]) -> None:
+def test_visible_solid_lines_are_on_lane_pixels(level: list[WorldFrame]) -> None:
     hits = tried = 0
     for frame in level:
         for lane in frame.lanes:
@@ -180,7 +180,7 @@ def test_cameras_are_those_of_cars(frames: list[WorldFrame]) -> None:
         np.testing.assert_allclose(frame.T_world_cam[:3, :3] @ frame.T_world_cam[:3, :3].T, np.eye(3), atol=1e-9)
 
 
-def test_a_drive_is_continuous_and_what_moves_moves_as_its_speed_says() -> None:
+def test_motion_in_a_drive_matches_speeds() -> None:
     rate_hz = 33.0
     camera = Camera(160, 48, 96.0, 96.0, 79.5, 22.0, height_m=1.5)
     drive = list(World(3, WorldConfig(samples=1), camera).frames(40, rate_hz))
@@ -205,7 +205,7 @@ def in_world(frame: WorldFrame, point_cam: np.ndarray) -> np.ndarray:
     return frame.T_world_cam[:3, :3] @ point_cam + frame.T_world_cam[:3, 3]
 
 
-def test_a_drive_begins_anew_the_same() -> None:
+def test_drive_is_repeatable() -> None:
     world = World(5, WorldConfig(width_px=160, height_px=48, samples=1))
     first, second = ([frame.image.tobytes() for frame in world.frames(3)] for _ in range(2))
     assert first == second
@@ -214,7 +214,7 @@ def test_a_drive_begins_anew_the_same() -> None:
 # --- the town that is driven around ---
 
 
-def test_a_round_ends_where_it_began_and_looks_the_same() -> None:
+def test_round_is_closed() -> None:
     street = town.scenario(town.DRIVES["twice"]).street
     s, d = np.arange(0.0, 300.0, 7.0), np.full(43, -4.0)
     first, second = street.place(s, d), street.place(s + town.ROUND_M, d)
@@ -224,7 +224,7 @@ def test_a_round_ends_where_it_began_and_looks_the_same() -> None:
     assert set(crossings[crossings < town.ROUND_M] + town.ROUND_M) <= set(crossings)
 
 
-def test_nothing_stands_on_the_towns_road() -> None:
+def test_no_scenery_is_on_the_towns_road() -> None:
     standing = town.scenario(town.DRIVES["twice"]).standing
     street = town.scenario(town.DRIVES["twice"]).street
     line = np.column_stack([street.x_m, street.y_m])[: round(town.ROUND_M / town.STEP_M)]
@@ -232,7 +232,7 @@ def test_nothing_stands_on_the_towns_road() -> None:
     assert apart.min() > 2.6  # the one lane back, and a parked car's half width
 
 
-def test_the_other_way_is_the_same_road() -> None:
+def test_reversed_street_is_the_same_road() -> None:
     there, back = (town.scenario(town.DRIVES[name]).street for name in ("twice", "back"))
     s, d = np.arange(10.0, 1000.0, 13.0), np.full(77, 3.0)
     own, other = there.place(s, d), back.place(back.length_m - s, -d)

@@ -1,4 +1,4 @@
-"""The yaw that the widths of boxes tell, seen from all around, of a car that neither motion nor body has told."""
+"""Yaw from the widths of boxes at several bearings, for a car without motion or body."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def turned(a_rad: float, b_rad: float) -> float:
 
 @pytest.mark.parametrize("yaw_deg", [0.0, 50.0, 70.0, 90.0])
 @pytest.mark.parametrize("scale", [0.95, 1.0, 1.05])
-def test_driving_past_a_parked_car_tells_how_it_stands(yaw_deg: float, scale: float) -> None:
+def test_passing_a_parked_car_determines_its_yaw(yaw_deg: float, scale: float) -> None:
     outline, yaw_rad, told = YawByOutline(CONFIG), math.radians(yaw_deg), 0.0
     outline.add_vehicle()
     for k in range(30):
@@ -55,7 +55,7 @@ def test_driving_past_a_parked_car_tells_how_it_stands(yaw_deg: float, scale: fl
 
 
 @pytest.mark.parametrize("yaw_deg", [-60.0, -50.0, -40.0])
-def test_a_yaw_that_looks_like_its_mirrored_one_is_told_uncertain(yaw_deg: float) -> None:
+def test_ambiguous_yaw_is_uncertain(yaw_deg: float) -> None:
     """Across the line of sight all outlines are as wide: driving by does not tell such a yaw from its mirror image."""
     outline, yaw_rad, told, sigma_rad = YawByOutline(CONFIG), math.radians(yaw_deg), 0.0, 0.0
     outline.add_vehicle()
@@ -65,7 +65,7 @@ def test_a_yaw_that_looks_like_its_mirrored_one_is_told_uncertain(yaw_deg: float
     assert turned(told, yaw_rad) < 3.0 * sigma_rad
 
 
-def test_the_same_sight_a_thousand_times_tells_no_more_than_ten_times() -> None:
+def test_repeated_observation_adds_no_information() -> None:
     weights = []
     for frames in (20, 1000):
         outline = YawByOutline(CONFIG)
@@ -77,7 +77,7 @@ def test_the_same_sight_a_thousand_times_tells_no_more_than_ten_times() -> None:
     assert weights[1] > math.radians(5.0)
 
 
-def test_a_car_in_front_of_a_turning_ego_stands_along_the_way_that_follows() -> None:
+def test_car_ahead_of_a_turning_ego_follows_the_road() -> None:
     """It is first seen out of a turn, and taken to stand as the ego is headed only once the way is straight."""
     outline, told = YawByOutline(CONFIG), 0.0
     outline.add_vehicle()
@@ -90,7 +90,7 @@ def test_a_car_in_front_of_a_turning_ego_stands_along_the_way_that_follows() -> 
     assert sigma_rad < math.radians(15.0)
 
 
-def test_rows_are_those_that_are_kept() -> None:
+def test_rows_of_kept_tracks_remain() -> None:
     outline = YawByOutline(CONFIG)
     for _ in range(3):
         outline.add_vehicle()
