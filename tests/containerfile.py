@@ -67,7 +67,7 @@ def why_not() -> str:
 
 
 def carry_out(place: Path, after: str = "true") -> str:
-    """Runs all of it, then a command as the image's user would; gives what was said. Raises AssertionError."""
+    """Runs all of it, then a command as the image's user; returns the output. Raises AssertionError."""
     script, stages = ["set -e", f"place={shlex.quote(str(place))}"], dict[str, int]()
     stage, workdir, user = -1, "/", "root"
     settings: dict[str, str] = {}

@@ -198,7 +198,7 @@ def references() -> Iterator[Target]:
 
 
 def optimizer() -> Target:
-    """graph.PoseGraph on Measurements that passed the wire and say anything; what it makes of them can be sent."""
+    """graph.PoseGraph on arbitrary Measurements that passed the wire; its estimates can be sent."""
     config, good = SlamConfig(), msgpack.unpackb(encode(BY_NAME["Measurements"]))
     graph, frame = PoseGraph(config.graph, config.weights), 0
 

@@ -1,4 +1,4 @@
-"""A street whose road rises and falls as one says, drawn by numpy: for `ground`, where the true ground must be known.
+"""A synthetic street with a given height profile, drawn by numpy, for tests with a known ground.
 
 The road is level across and its height is a function of the way along it alone, so that the ray of an image row, which
 has one slope, meets it in one place: exact for every grade, vertical curve and crest. House fronts on both sides give
@@ -21,7 +21,7 @@ TEXEL_M, SIDE, LEVELS = 0.02, 1024, 6
 LOOK_M, SAMPLES = 160.0, 4000
 LEFT_M, RIGHT_M, FRONT_M = -7.0, 6.5, 6.0  # the house fronts, and how high they are
 WHEELBASE_M, CAMERA_AHEAD_M = 2.7, 1.7  # of the rear axle
-CURVE_M, HOLD_M = 30.0, 40.0  # the way over which a grade comes and goes, and on which it lasts
+CURVE_M, HOLD_M = 30.0, 40.0  # transition length of a grade, and its length
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class GradedRoad:
         return out
 
     def stand(self, rear_m: float) -> Stand:
-        """Of a car whose rear axle stands at `rear_m`; the camera is aligned with the body, as high as calibrated."""
+        """Pose of a car with its rear axle at `rear_m`; the camera is fixed to the body at the calibrated height."""
         rear, front = (float(self.up_m(rear_m + a)) for a in (0.0, WHEELBASE_M))
         rise = math.atan2(front - rear, WHEELBASE_M)
         height_m = self.camera.height_m
@@ -63,7 +63,7 @@ class GradedRoad:
         return Stand(rear_m + CAMERA_AHEAD_M - height_m * math.sin(rise), up, self.camera.pitch_rad - rise)
 
     def pixel_row(self, stand: Stand, ahead_m: float) -> float:
-        """The image row in which the road lies `ahead_m` in front of the camera."""
+        """The image row of the road `ahead_m` in front of the camera."""
         down = stand.up_m - float(self.up_m(stand.way_m + ahead_m))
         c, s = math.cos(stand.pitch_rad), math.sin(stand.pitch_rad)
         return self.camera.cy_px + self.camera.fy_px * (down * c - ahead_m * s) / (ahead_m * c + down * s)

@@ -32,7 +32,7 @@ class Head:
         return self.answer(image)
 
     def answer(self, image: np.ndarray) -> Findings:
-        """What it says of an image."""
+        """Findings for an image."""
         if self.found is not None:
             return self.found
         if self.role == "detector":

@@ -24,7 +24,7 @@ PYTHONS = "3.11", "3.12", "3.13"
 
 
 class Quiet(SimpleHTTPRequestHandler):
-    """Lists a folder as an index does, and says nothing of it."""
+    """Lists a folder as an index does, without logging."""
 
     def log_message(self, text: str, *values: object) -> None:
         return

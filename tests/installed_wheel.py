@@ -89,7 +89,7 @@ def drive(birdslam: Sequence[str | Path], folder: Path, **environment: str) -> N
     summary = json.loads((folder / "out" / "summary.json").read_text())
     assert summary["ended"] == "end of source", said
     assert summary["frames_in"] == summary["frames_processed"] == FRAMES, said
-    assert summary["invalid_frames"] <= 5, said  # of which the first knows no motion yet
+    assert summary["invalid_frames"] <= 5, said  # the first has no motion
     assert set(summary["models"]) == {"multitask"}, said
     assert 5.0 < summary["path_m"] < 20.0, said
     print("\n".join(line for line in said.splitlines() if not line.startswith(("frame ", "waiting"))))

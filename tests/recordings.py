@@ -15,7 +15,7 @@ PERIOD_NS = 100_000_000
 
 
 class Frames(Recording):
-    """`count` frames at 10 Hz, each as grey as its number says; those of `torn` can't be read."""
+    """`count` frames at 10 Hz, each with its number as grey level; those in `torn` are unreadable."""
 
     name, camera, rate_hz = "drive", SMALL, 10.0
 

@@ -43,7 +43,7 @@ SPEED_MPS = 5.0
 # where another process has the core; "reliable" changes nothing of it, since rmw_zenoh blocks for KEEP_ALL alone
 _DROP = "transport/link/tx/queue/congestion_control/drop"
 PATIENT = {f"{_DROP}/wait_before_drop": 100_000, f"{_DROP}/max_wait_before_drop_fragments": 100_000}
-OVERRIDE = "ZENOH_CONFIG_OVERRIDE"  # by which a session of ROS is told so
+OVERRIDE = "ZENOH_CONFIG_OVERRIDE"  # announces it to ROS sessions
 
 
 def write_definitions(folder: Path) -> None:
@@ -97,7 +97,7 @@ def hear(port: int, domain: int, topics: list[str]) -> None:
 
             def came(message: Any, topic: str = topic) -> None:
                 line = {"topic": topic, "came_ns": time.time_ns(), "message": plain(message)}
-                with whole_lines:  # each topic has a thread of its own
+                with whole_lines:  # each topic has a thread
                     print(json.dumps(line), flush=True)
 
             qos = QosProfile(durability=QosDurability.TRANSIENT_LOCAL) if topic == "/tf_static" else None

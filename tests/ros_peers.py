@@ -1,5 +1,5 @@
 """Does a listener of ROS 2 hear every estimate, and how late? A vehicle's bus, `birdslam ros`, a router and a listener
-of the independent package zenoh-ros2-sdk, each a process of its own.
+of the independent package zenoh-ros2-sdk, each in a separate process.
 
     python -m perf ros [--seconds 30] [--rate 33] [--vehicles 10]
 """

@@ -63,7 +63,7 @@ class Perceive:
 
 
 class Tape:
-    """Writes down what an optimizer makes of measurements; says what of it never came to the recorder."""
+    """Records the messages of an optimizer; reports those that never reached the recorder."""
 
     def __init__(self, place: Path, **config: Any) -> None:
         self.path = place / "drive.mcap"

@@ -123,7 +123,7 @@ def test_the_offline_example(tmp_path: Path) -> None:
 
 
 def test_the_python_of_the_readme(capsys: pytest.CaptureFixture[str]) -> None:
-    """As it stands there, over the first 101 frames of the demo; it prints what the readme shows."""
+    """Runs it unchanged over the first 101 frames of the demo; it prints the readme's output."""
     readme = (ROOT / "README.md").read_text()
     frames = "recording.undistorted_frames()"
     code = next(block for block in re.findall(r"```python\n(.*?)```", readme, re.DOTALL) if frames in block)

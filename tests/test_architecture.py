@@ -59,7 +59,7 @@ def imports(path: Path) -> set[str]:
 
 
 def table() -> dict[str, set[str]]:
-    """Package -> the packages that it may import, as CONTRIBUTING.md says it."""
+    """Package -> the packages that it may import, from CONTRIBUTING.md."""
     rows = re.findall(r"^\| `([a-z_.]+)` \| [^|]* \| ([^|]*) \|$", (ROOT / "CONTRIBUTING.md").read_text(), re.M)
     every = {name for name, _ in rows}
     return {

@@ -49,7 +49,7 @@ def test_the_atlas_returns_the_estimates() -> None:
         atlas.add(estimate, graph.map_update())
     way = atlas.trajectory()
     assert way is not None
-    assert way.ego[0].frame_id == 1  # the first frame knows no motion: it is not valid
+    assert way.ego[0].frame_id == 1  # the first frame has no motion and is invalid
     assert way.ego[-1].frame_id == way.frame_id == 299
     for pose in way.ego:
         assert pose.T_world_body == estimates[pose.frame_id].T_world_ego

@@ -252,7 +252,7 @@ def test_a_process_that_is_killed_is_a_failure_of_its_drive_alone(
 @pytest.mark.slow
 @pytest.mark.processes
 def test_a_killed_batch_resumes(tmp_path: Path) -> None:
-    """Killed while its second drive is on the way: its process ends with it, and the next batch does the rest."""
+    """Killed during its second drive: the drive's process ends too, and the next batch does the rest."""
     drives = [kitti(tmp_path / "00", 3), kitti(tmp_path / "01", 400)]
     output, alone = tmp_path / "out", tmp_path / "alone"
     command = [sys.executable, "-m", "birdslam.runtime.cli.main", "batch", *map(str, drives)]

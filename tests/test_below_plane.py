@@ -1,4 +1,4 @@
-"""Below the horizon nothing lies farther than the road: a corner that seems to is left out from then on."""
+"""Below the horizon nothing is farther than the road: features that appear farther are rejected."""
 
 from __future__ import annotations
 

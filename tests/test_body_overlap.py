@@ -1,4 +1,4 @@
-"""One network's bodies for another's boxes: by overlap, in the same image, and nothing where nobody saw a body."""
+"""One network's bodies for another's boxes: by overlap, in the same image, and unknown without overlap."""
 
 from __future__ import annotations
 

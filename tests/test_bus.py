@@ -284,7 +284,7 @@ def test_a_matching_wait_ends_in_time_and_when_somebody_comes(join: Any) -> None
     out = join("capture").publisher("frame")
     assert not out.wait_matched(0.05)
     assert not out.matched
-    out.put(frame_ref(1))  # to nobody
+    out.put(frame_ref(1))  # without subscriber
     frames = hub.subscriber("frame")
     assert out.wait_matched(LIMIT_S)
     frames.close()
@@ -381,7 +381,7 @@ def test_close_wakes_all_waiting_threads(base: Path) -> None:
     assert list((base / "car").iterdir()) == []
 
 
-# Processes that are killed. Each says on its standard output that it is at work.
+# Processes that are killed. Each prints "at work".
 SEND = """
 import sys
 from pathlib import Path

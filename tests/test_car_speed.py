@@ -99,7 +99,7 @@ def test_old_readings_are_told() -> None:
     assert heard(readings, 1.1).status == []
     assert heard(readings, 1.0 + CONFIG.late_s + 0.1).status == [Status.CAR_SPEED_LATE]
     assert heard(readings, 1.0 + CONFIG.missing_s + 0.1).status == [Status.CAR_SPEED_MISSING]
-    assert SpeedReadings(CONFIG).status == []  # of a car that never told any
+    assert SpeedReadings(CONFIG).status == []  # of a car without speed readings
 
 
 def test_a_jump_is_refused_until_it_lasts() -> None:
@@ -118,7 +118,7 @@ def test_a_jump_is_refused_until_it_lasts() -> None:
 
 
 class World:
-    """Images that see each way, in a unit of their own; a road that says the metres; readings."""
+    """Odometry of images in an arbitrary scale; a road that gives the metric scale; speed readings."""
 
     def __init__(self, unit_m: float = 1.0) -> None:
         self.config = RoadScaleConfig()
@@ -186,7 +186,7 @@ def test_at_one_speed_the_delay_stays_what_it_was() -> None:
 def test_without_a_road_the_metres_are_the_cars_and_as_sure_as_its_factor() -> None:
     world = World(unit_m=0.7)
     world.drive(lambda t: 12.0, readings_of(lambda t: 12.0, 9.0, 1.03), (1.0, 8.0), road=False)
-    assert world.error == pytest.approx(0.03, abs=0.003)  # nothing tells the tyres' error
+    assert world.error == pytest.approx(0.03, abs=0.003)  # the tyres' scale factor is not observable
     assert world.sigma(0) >= 0.98 * CONFIG.sigma_factor_rel
     assert world.filter.x[CAR_FACTOR] == pytest.approx(0.0, abs=0.002)
 
@@ -200,7 +200,7 @@ def test_what_a_lit_road_taught_holds_in_the_dark() -> None:
     assert by_day < world.sigma(0) < 0.02  # far less than the factor beforehand
     alone = World()
     alone.drive(lambda t: 12.0, [], (1.0, 20.0), road=True)
-    assert len(alone.filter.x) == STATES  # nothing changes for a car that never tells
+    assert len(alone.filter.x) == STATES  # nothing changes without speed readings
 
 
 def test_a_motion_that_images_see_roughly_is_smoothed_by_readings_that_are_there() -> None:
@@ -260,7 +260,7 @@ def test_a_number_that_stops_changing_is_no_reading_any_more() -> None:
     assert speed.newest_ns < 1.55 * NS_PER_S
     speed.add_readings([reading(3.52, 10.2, 0.2)], round(3.52 * NS_PER_S))
     assert speed.status == []
-    assert heard(readings_of(lambda t: 10.0, 3.5), 3.5).status == []  # of a car that only ever said one number
+    assert heard(readings_of(lambda t: 10.0, 3.5), 3.5).status == []  # of a car with a constant reading
     stopped = readings_of(lambda t: max(0.0, 3.0 - 3.0 * t), 3.5)
     assert heard(stopped, 3.5).status == []
 

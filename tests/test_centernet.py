@@ -39,7 +39,7 @@ CELLS = (8, 16)  # of 4 px
 
 
 def maps(objects: list[tuple[int, tuple[float, float, float, float], float]]) -> dict[str, NDArray[np.float32]]:
-    """Outputs that say: class, box in input pixels, score."""
+    """Outputs that encode class, box in input pixels, score."""
     heat = np.full((1, 3, *CELLS), -9.0, np.float32)
     sizes, offsets = np.zeros((1, 2, *CELLS), np.float32), np.zeros((1, 2, *CELLS), np.float32)
     for index, (x1, y1, x2, y2), score in objects:
@@ -62,7 +62,7 @@ def test_peaks_are_boxes_of_the_image_best_first(tmp_path: Path) -> None:
     objects = [
         (0, (8.0, 8.0, 20.0, 16.0), 0.6),
         (2, (30.0, 10.0, 50.0, 30.0), 0.9),
-        (1, (2.0, 20.0, 10.0, 30.0), 0.9),  # of a class that nobody asked for
+        (1, (2.0, 20.0, 10.0, 30.0), 0.9),  # of a class without label
         (0, (40.0, 2.0, 44.0, 6.0), 0.2),  # below the threshold
         (2, (8.0, 8.0, 20.0, 16.0), 0.4),  # on the first car: a rival
     ]

@@ -27,7 +27,7 @@ WORLDS = [drive(DriveConfig(frames=120, vehicles=5, outliers=0.05, drop=0.1), se
 
 
 def goes_on(graph: PoseGraph, log: list[Measurements]) -> bytes:
-    """All that the graph says of these frames."""
+    """The graph's estimates of these frames."""
     return b"".join(msgspec.msgpack.encode((graph.optimise(m), graph.map_update(), graph.epoch)) for m in log)
 
 

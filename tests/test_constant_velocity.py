@@ -17,7 +17,7 @@ STEP_M, BEFORE, HIDDEN, AFTER = 0.5, 16, 30, 11  # images at 10 Hz
 
 
 def _far_alone(image: np.ndarray) -> np.ndarray:
-    """What lies some 60 m ahead and more; the rest is black, as at night."""
+    """Shows only the scene beyond about 60 m; the rest is black, as at night."""
     out, (u, v) = np.full_like(image, 40), (int(CAMERA.cx_px), int(CAMERA.cy_px))
     far = slice(0, v + 4), slice(u - 36, u + 36)
     out[far] = image[far]
@@ -118,7 +118,7 @@ def test_held_step_is_the_last_one_with_sigma_from_max_acceleration() -> None:
 
 
 def test_braking_with_weak_images_stays_within_sigma() -> None:
-    """They tell its steps to 0.2 m; it brakes by 4 m/s^2, as for a light. Held at one speed it was 2 m/s off in 1 s."""
+    """The images give steps to 0.2 m; the car brakes at 4 m/s^2."""
     prior, step_m = _driven(10), 1.0
     rng = np.random.default_rng(1)
     for k in range(20):

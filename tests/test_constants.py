@@ -20,7 +20,7 @@ RECORDINGS = re.compile(r"KITTI|\b00[01]\d\b|raw clip|motorway clip|shipped driv
 
 
 def in_code(name: str) -> object:
-    """A key of the method's defaults, or what stands in a module."""
+    """A field of the default configuration, or a constant of a module."""
     value: object
     if name.startswith("slam."):
         value, parts = SlamConfig(), name.split(".")[1:]

@@ -78,7 +78,7 @@ def test_odometry_takes_grey_before_colour_and_the_matrix_of_the_camera(odometry
     assert (recording.camera.fx_px, recording.camera.cx_px) == (60.0, 31.0)
     assert frames[0].image is not None
     assert frames[0].image.shape == (HEIGHT, WIDTH, 3)
-    # P = K [I | t]: t = ((30 - 31 * 0.01) / 60, (6 - 16 * 0.01) / 60, 0.01), and the camera stands at -t
+    # P = K [I | t]: t = ((30 - 31 * 0.01) / 60, (6 - 16 * 0.01) / 60, 0.01), and the camera is at -t
     assert recording.T_cam0_cam()[:3, 3] == pytest.approx([-29.69 / 60.0, -5.84 / 60.0, -0.01])
 
 

@@ -125,7 +125,7 @@ class Blind(FrontEnd):
 
 @pytest.fixture
 def pixels(tmp_path: Path) -> Iterator[dict[str, int]]:
-    """Where a small black image lies in the ring of the vehicle `test`, as references name it."""
+    """The position of a small black image in the ring of the vehicle `test`."""
     with FrameRing(ring_path("test", tmp_path), 4, 4, channels=1) as ring:
         slot, sequence = ring.write(np.zeros((4, 4), dtype=np.uint8))
         place = {"slot": slot, "sequence": sequence, "ring_epoch": ring.epoch}

@@ -70,7 +70,7 @@ def test_motion_is_plausible_for_a_car(demo: DemoRecording) -> None:
 
 
 def test_bodies_project_into_their_boxes(demo: DemoRecording) -> None:
-    """A footprint on the road projects into the lower part of its box; hidden bodies are told of, too."""
+    """A footprint on the road projects into the lower part of its box; hidden bodies are included."""
     checked, hidden = 0, 0
     for index in range(0, 1000, 50):
         plane = demo.truth_ground(index)

@@ -35,7 +35,7 @@ def demo() -> DemoRecording:
 
 @pytest.fixture(scope="module")
 def truthful(demo: DemoRecording) -> list[Estimate]:
-    """Estimates that say what is true."""
+    """Estimates equal to the truth."""
     poses, out = as_poses(demo.truth_poses()), []
     T_world_first, T_cam_ego = mount_pose_of(demo, 0), inverse(mount_pose_of(demo, 0))
     for k in FRAMES:
@@ -59,7 +59,7 @@ def truthful(demo: DemoRecording) -> list[Estimate]:
 
 
 def stretched(estimate: Estimate, factor: float) -> Estimate:
-    """The same way, longer by a factor; vehicles stand where they stood from the ego."""
+    """The same trajectory scaled by a factor; vehicles keep their positions relative to the ego."""
     pose = estimate.T_world_ego
     ego = SE2(factor * pose.x_m, factor * pose.y_m, pose.yaw_rad)
     vehicles = tuple(
@@ -99,7 +99,7 @@ def test_new_epoch_continues_at_last_pose(demo: DemoRecording, truthful: list[Es
         moved = origin @ estimate.T_world_ego
         cut.append(msgspec.structs.replace(estimate, epoch=1, T_world_ego=moved, vehicles=vehicles))
     step = truthful[half - 1].T_world_ego.between(truthful[half].T_world_ego)
-    found = grade(demo, cut)  # short by the one step that nobody saw
+    found = grade(demo, cut)  # shorter by one unobserved step
     assert whole.ego_ate_m < found.ego_ate_m < math.hypot(step.x_m, step.y_m)
     assert found.vehicle_centre_m == pytest.approx(0.0, abs=1e-9)
 
@@ -174,7 +174,7 @@ def test_a_run_without_truth_or_without_end_has_no_report(settings: dict[str, ob
 
 
 def test_movers_are_evaluated_at_any_range(demo: DemoRecording) -> None:
-    """What moves is reported to drive, what stands is not; then all of it, at a third too far."""
+    """Moving vehicles are reported as moving; then all vehicles, at distances a third too large."""
 
     def told(everything: bool, factor: float) -> DemoGrade:
         estimates = []

@@ -223,7 +223,7 @@ def test_install_start_fail_and_remove(machine: Machine) -> None:
     assert machine("readlink", "/opt/birdslam/current") != before
     assert len(machine("ls", "/opt/birdslam/releases").split()) == 2
 
-    # What is wrong is said by the start, in one line; after some more of them systemd gives up.
+    # Each start reports the error in one line; after several starts systemd gives up.
     machine.write("/etc/birdslam/vehicle.toml", "no_such_key = 1\n")
     machine.write("/etc/systemd/system/birdslam.service.d/limit.conf", "[Unit]\nStartLimitBurst=3\n")
     machine("systemctl", "daemon-reload")
@@ -235,7 +235,7 @@ def test_install_start_fail_and_remove(machine: Machine) -> None:
     machine("systemctl", "reset-failed", "birdslam")
     machine.write("/etc/birdslam/vehicle.toml", LOOP)
 
-    # Started: systemctl start returns once the supervisor has said READY; a planner then gets estimates.
+    # systemctl start returns after the supervisor's READY; a planner then gets estimates.
     machine("systemctl", "start", "birdslam")
     assert machine("systemctl", "is-active", "birdslam") == "active"
     assert len(estimates(machine, 3)) == 3

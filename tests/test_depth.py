@@ -58,7 +58,7 @@ def test_metric_depth_in_its_unit_and_bounds(tmp_path: Path, shape: tuple[int, .
 
 
 def test_canonical_depth_is_converted_to_the_camera(tmp_path: Path) -> None:
-    """A focal length twice the canonical one makes everything look twice as near as it is."""
+    """Twice the canonical focal length makes everything appear at half the distance."""
     depth = run(tmp_path, METRIC + "canonical_focal_rel = 0.3125\n", np.full((1, 1, 8, 16), 10.0, np.float32))
     own = depth.in_metres(CAMERA)  # fx / width = 0.625
     np.testing.assert_allclose(own.depth_m, 20.0)
@@ -68,7 +68,7 @@ def test_canonical_depth_is_converted_to_the_camera(tmp_path: Path) -> None:
 def test_padding_is_removed(tmp_path: Path) -> None:
     text = METRIC.replace('{ mode = "stretch" }', '{ mode = "fit_pad", align = "centre" }')
     values = np.full((1, 1, 16, 32), 99.0, np.float32)
-    values[..., 4:12, :] = 7.0  # where a 4:1 image lies in the 2:1 input
+    values[..., 4:12, :] = 7.0  # position of a 4:1 image in the 2:1 input
     depth = run(tmp_path, text, values, (16, 64))
     assert depth.depth_m.shape == (8, 32)
     np.testing.assert_array_equal(depth.depth_m, 7.0)

@@ -248,7 +248,7 @@ def test_the_page_states_limits_that_hold() -> None:
 
 
 class Base(msgspec.Struct):
-    """With fields of its own."""
+    """Has fields."""
 
     first: int = 1  # of the base
     # Told above,
@@ -257,7 +257,7 @@ class Base(msgspec.Struct):
 
 
 class Derived(Base):
-    """A field's own line goes before what stands above it."""
+    """A comment on a field's line has priority over one above it."""
 
     # A heading
     third: dict[str, int] = msgspec.field(

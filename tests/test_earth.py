@@ -133,7 +133,7 @@ def test_csv_nmea_and_gpx_are_read() -> None:
     assert second.speed_mps is None
     gga = "GPGGA,123519.50,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,"
     (fix,) = read_fixes(sentence(gga) + sentence(RMC) + b"$GPRMC,cut off", "a.nmea", 7)
-    assert fix.t_source_ns == 7  # UTC of another year: it begins with the recording
+    assert fix.t_source_ns == 7  # UTC of another year: aligned to the start of the recording
     assert fix.latitude_deg == pytest.approx(48.0 + 7.038 / 60.0)
     assert fix.speed_mps == pytest.approx(22.4 * 0.514444)
     assert fix.sigma_m == pytest.approx(3.6)
@@ -169,7 +169,7 @@ def test_mutated_files_give_fixes_or_the_error(good: bytes, place: int, noise: b
 
 
 def test_track_of_another_clock_is_aligned_by_shape() -> None:
-    """The fixes begin ten minutes before the drive and end two minutes after it."""
+    """The fixes start ten minutes before the drive and end two minutes after it."""
     t_ns, poses, enu = a_drive()
     before = enu[0] + np.outer(np.arange(600, 0, -1), (-7.0, 3.0)) + 40.0 * np.sin(np.arange(600))[:, None]
     after = enu[-1] + np.outer(np.arange(1, 121), (2.0, 9.0))
@@ -221,7 +221,7 @@ def test_fixes_without_date_continue_over_midnight() -> None:
 def test_table_columns_are_identified_by_meaning(encoding: str) -> None:
     text = "Time,Lat,Lon,Speed_kmh\n1700000000.5,51.0,7.0,36\n1700000001.5,51.1,7.0,\n"
     track = read_track(text.encode(encoding), "a.csv", 3)
-    assert [fix.t_source_ns for fix in track.fixes] == [3, 1_000_000_003]  # Unix time, and the film begins at 0
+    assert [fix.t_source_ns for fix in track.fixes] == [3, 1_000_000_003]  # Unix time; the film starts at 0
     assert track.fixes[0].speed_mps == pytest.approx(10.0)
     assert not track.clock_is_known
 

@@ -43,7 +43,7 @@ LENS = Camera(1280, 720, 900.0, 900.0, 640.0, 360.0, 1.4, distortion=(-0.3, 0.1,
 
 @dataclass
 class Seen:
-    """Frames of the shipped drive, what its own network finds in them, and what `step` says of those boxes."""
+    """Frames of the shipped drive, the network's detections in them, and the results of `step` for those boxes."""
 
     recording: Any
     frames: list[Frame]
@@ -232,7 +232,7 @@ def test_scores_of_mot_text_are_probabilities(
     ("ids", "labels"),
     [
         ((3, 1, 8), ("car", "person", "truck")),  # the 2017 set
-        ((2, 0, 7), ("car", "person", "truck")),  # the 80 classes: 0 is none of the 2017 set
+        ((2, 0, 7), ("car", "person", "truck")),  # the 80 classes; the 2017 set has no class 0
         ((2, 2, 5), ("car", "car", "bus")),  # both sets know these ids: cars are more frequent than bicycles
         ((3, 3, 2), ("car", "car", "bicycle")),
         ((2, 12, 7), ("car", "coco 12", "truck")),  # 12 is a gap of the 2017 set

@@ -37,7 +37,7 @@ IMAGE = np.zeros((360, 640), np.uint8)
 
 
 def egos(n: int) -> list[SE2]:
-    out = [SE2(5.0, -3.0, 1.0)]  # a world of its own
+    out = [SE2(5.0, -3.0, 1.0)]  # a separate world
     for _ in range(n - 1):
         out.append(out[-1] @ STEP)
     return out
@@ -73,7 +73,7 @@ def test_motions_are_those_of_the_file(ego: bool, times: bool) -> None:
 
 @given(st.lists(st.floats(0.0, 0.9), min_size=2, max_size=8, unique=True))
 def test_poses_are_interpolated(times_s: list[float]) -> None:
-    """At any times the motions add up to the way that the file has between them."""
+    """At any times the motions add up to the file's motion between them."""
     times_ns = sorted(round(t * NS_PER_S) for t in times_s)
     if len(set(times_ns)) < len(times_ns):
         return
@@ -91,7 +91,7 @@ def test_poses_are_interpolated(times_s: list[float]) -> None:
 
 
 def test_missing_poses_are_not_invented() -> None:
-    """A hole is coasted through with a covariance that grows, and the next pose is one from the last that was told."""
+    """A gap is coasted with a growing covariance; the next motion starts at the last given pose."""
     told = trajectory(40)
     assert told.t_ns is not None
     kept = (np.arange(40) < 10) | (np.arange(40) >= 16)

@@ -85,7 +85,7 @@ class Line:
 
 
 class LaneLine(Factor):
-    """Offset and heading, whose Jacobian is none of unit vectors."""
+    """Offset and heading, with a general Jacobian."""
 
     name = "lane line"
     equation = "(d - y, psi - yaw)"
@@ -176,7 +176,7 @@ def test_fix_moves_the_ego_by_its_share_of_information(sigma_m: float) -> None:
 
 
 def test_visible_vehicles_move_with_the_ego() -> None:
-    """A fix says nothing of where vehicles are from the ego, beyond what the landmarks' common past makes of it."""
+    """A fix does not change the vehicles' poses relative to the ego, except through correlation with landmarks."""
     before = run(graph_with(), {})[-1]
     after = run(graph_with(Gnss()), {LOG[-1].frame_id: (fix_at(before, (0.2, 0.1), 0.05),)})[-1]
     assert len(before.vehicles) == 3
@@ -240,7 +240,7 @@ def test_non_finite_edge_is_left_out() -> None:
     assert run(graph_with(Gnss(), LaneLine()), {m.frame_id: nowhere for m in LOG}) == run(graph_with(), {})
 
 
-# --- a line of the lane: a Jacobian of its own ---
+# --- a lane line: a general Jacobian ---
 
 
 def test_line_constrains_lateral_position_and_heading() -> None:
@@ -306,7 +306,7 @@ def test_vehicles_connected_by_an_edge_share_a_covariance() -> None:
 
 
 def test_line_of_a_vehicle_is_the_same_edge_jointly_and_separately() -> None:
-    """Edges by each vehicle's own numbers, with Jacobians that are none of unit vectors."""
+    """Edges to single vehicles, with general Jacobians."""
 
     class Aside(Factor):
         name = "aside"

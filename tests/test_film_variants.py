@@ -101,7 +101,7 @@ def test_noise_is_in_each_image_and_invisible(tmp_path: Path) -> None:
 
 
 def test_uneven_true_steps_do_not_affect_the_ratio_at_any_rate() -> None:
-    """As KITTI's: the ways of a second are compared, not its frames."""
+    """As in KITTI: distances per second are compared, not frames."""
     courses = []
     for every in (1, 2):
         course = Course()

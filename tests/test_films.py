@@ -177,7 +177,7 @@ def test_films_of_a_directory_are_one_drive_in_natural_order(counts: list[int], 
 
 def test_gap_between_films_is_reported(tmp_path: Path) -> None:
     film(tmp_path / "20240131_120000.mp4", range(0, 2000, 40))
-    film(tmp_path / "20240131_120002.mp4", range(0, 2000, 40))  # begins where the first ends
+    film(tmp_path / "20240131_120002.mp4", range(0, 2000, 40))  # starts at the end of the first
     film(tmp_path / "20240131_120134.mp4", range(0, 400, 40))  # half a minute after the second has ended: 90 s
     seen = frames(tmp_path)
     gaps = [frame for frame in seen if frame.image is None]
@@ -225,7 +225,7 @@ def test_non_film_file_is_a_one_line_error(tmp_path: Path, capfd: pytest.Capture
         silence = av.AudioFrame.from_ndarray(np.zeros((2, 1024), np.float32), "fltp", "stereo")
         silence.rate, silence.pts = 44100, 0
         container.mux([*sound.encode(silence), *sound.encode(None)])
-    with av.open(str(tmp_path / "timeless.mp4"), "w") as container:  # its frames say no times
+    with av.open(str(tmp_path / "timeless.mp4"), "w") as container:  # its frames have no times
         stream = container.add_stream("libx264", rate=30)
         stream.width, stream.height = WIDTH, HEIGHT
         for number in range(20):

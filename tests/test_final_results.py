@@ -214,7 +214,7 @@ def test_run_writes_evaluated_trajectories_and_removes_temporary_recording(tmp_p
 
 
 def call(*arguments: str) -> int:
-    """The command in a process of its own, as it computes in an environment of its own."""
+    """Runs the command in a separate process with its own environment."""
     return subprocess.run([sys.executable, "-m", "birdslam.runtime.cli.main", *arguments], timeout=170).returncode
 
 

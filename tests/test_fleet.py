@@ -144,7 +144,7 @@ def tls(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def port() -> Iterator[int]:
-    with socket.socket() as holder:  # nobody else is given it meanwhile
+    with socket.socket() as holder:  # reserved meanwhile
         holder.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         holder.bind(("127.0.0.1", 0))
         yield int(holder.getsockname()[1])
@@ -209,7 +209,7 @@ def arrived(vehicle: Vehicle, fleet: Fleet, frame_id: int) -> bool:
 
 
 def first(vehicle: Vehicle, fleet: Fleet) -> None:
-    """Until the way from the vehicle to the listener is there, and nothing is under way."""
+    """Waits until vehicle and listener are connected and no message is in transit."""
     until(lambda: vehicle.name in fleet.vehicles and fleet.latest(vehicle.name).alive, f"{vehicle.name} is alive")
     end_s, frame_id = time.monotonic() + LIMIT_S, 0
     while not arrived(vehicle, fleet, frame_id):
@@ -256,7 +256,7 @@ def test_one_listener_follows_three_vehicles(tmp_path_factory: pytest.TempPathFa
             assert fleet.trajectory("red", timeout_s=0.3) is None  # its supervisor is not there
             assert [r.vehicle for r in fleet.readings()] == sorted((*NAMES, "white"))
             assert fleet.latest("white").silent_ms == float("inf")
-            silent = next(r for r in fleet.estimates(200.0) if r.vehicle == "white")  # told of, without a word from it
+            silent = next(r for r in fleet.estimates(200.0) if r.vehicle == "white")  # without a message from it
             assert not silent.alive
             assert not silent.on_time
             say(red, fleet)
@@ -294,7 +294,7 @@ def raw_config(tls: Path, port: int, name: str, authority: str = "ca.pem", limit
 @processes
 @needs_openssl
 def test_each_certificate_has_only_its_permissions(tls: Path, port: int) -> None:
-    """A vehicle, a listener and a stranger write under every key, say that somebody lives, and answer queries."""
+    """A vehicle, a listener and a stranger write every key, declare liveliness, and answer queries."""
     with ExitStack() as stack:
         stack.enter_context(zenoh.open(router_config(router_table(tls, port))))
         fleet = stack.enter_context(Fleet(link(tls, port, "operator")))
@@ -336,7 +336,7 @@ def test_each_certificate_has_only_its_permissions(tls: Path, port: int) -> None
             assert fleet.received(name).malformed == 0
         assert "blue" not in fleet.vehicles
         assert fleet.refused == 0
-        assert fleet.alive("red") == frozenset()  # nobody says that it lives but itself
+        assert fleet.alive("red") == frozenset()  # only the vehicle declares its liveliness
         assert fleet.map("red", timeout_s=0.3) is None
         assert not overheard
         for session in ears:
@@ -360,7 +360,7 @@ def test_connection_needs_a_certificate_of_the_authority(tls: Path, port: int) -
 def test_flood_and_crash_do_not_affect_other_vehicles(
     tmp_path_factory: pytest.TempPathFactory, tls: Path, port: int
 ) -> None:
-    """Red sends as fast as it can, then dies: green and blue come without a gap, and each is told of as it is."""
+    """Red floods, then dies: green and blue arrive without gaps, and each vehicle's state is reported."""
     base = tmp_path_factory.mktemp("f")
     with zenoh.open(router_config(router_table(tls, port))):
         red, green, blue = vehicles = [Vehicle(name, base, tls, port) for name in NAMES]
@@ -401,7 +401,7 @@ def test_flood_and_crash_do_not_affect_other_vehicles(
 @processes
 @needs_openssl
 def test_restarted_router_is_found(tmp_path_factory: pytest.TempPathFactory, tls: Path, port: int) -> None:
-    """By a vehicle and by a listener; meanwhile the vehicle is told as not alive."""
+    """By a vehicle and by a listener; meanwhile the vehicle is reported as not alive."""
     table = router_table(tls, port)
     router = zenoh.open(router_config(table))
     red = Vehicle("red", tmp_path_factory.mktemp("f"), tls, port)
@@ -421,7 +421,7 @@ def test_restarted_router_is_found(tmp_path_factory: pytest.TempPathFactory, tls
 @processes
 @needs_openssl
 def test_commands_reconnect(tmp_path_factory: pytest.TempPathFactory, tls: Path, port: int) -> None:
-    """`birdslam uplink` before its router, a router that is killed and begun again, an uplink that is killed."""
+    """`birdslam uplink` starts before its router, the router restarts, the uplink is killed."""
     base = tmp_path_factory.mktemp("f")
     (base / "router.toml").write_text(
         f'[router]\nlisten = "tls/127.0.0.1:{port}"\nca = "{tls}/ca.pem"\ncertificate = "{tls}/router.pem"\n'
@@ -439,7 +439,7 @@ def test_commands_reconnect(tmp_path_factory: pytest.TempPathFactory, tls: Path,
     started: list[subprocess.Popen[bytes]] = []
 
     def start(*what: str, says: str) -> tuple[subprocess.Popen[bytes], Path]:
-        """A command that has said that; zenoh logs to the standard output too."""
+        """Waits until a command has printed this; zenoh logs to the standard output too."""
         log = base / f"{len(started)}.log"
         with log.open("wb") as out:
             command = [sys.executable, "-P", "-m", "birdslam.runtime.cli.main", *what]

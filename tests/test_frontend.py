@@ -162,7 +162,7 @@ def test_only_confirmed_vehicles_with_boxes_in_this_frame_have_edges() -> None:
 
 def test_landmarks_are_near_features_on_the_road() -> None:
     out = run({1: motion(1, SE2(1.0, 0.0, 0.0))}, [seeing(), seeing()])
-    (landmark,) = out[1].cp  # one corner lies past the depth threshold, one above the horizon
+    (landmark,) = out[1].cp  # one feature is beyond the depth threshold, one above the horizon
     assert landmark.landmark == 7
     assert 8.0 < landmark.x_m < 10.0
 
@@ -225,7 +225,7 @@ def test_lanes_keep_ids_until_a_new_epoch() -> None:
     assert all(side == sides[5] for side in sides[5:18])
     assert all(-0.5 < p.y_m - sides[5][p.lane] < 0.5 for m in out[5:18] for p in m.lanes if p.lane >= 0)
     assert max(p.x_m for p in out[17].lanes if p.lane >= 0) > 10.0
-    assert not set(sides[5]) & set(sides[18])  # lost: nothing says that these are the same
+    assert not set(sides[5]) & set(sides[18])  # lost: the identity is unknown
     assert sorted(sides[24].values()) == [-2, 3]
 
 

@@ -164,7 +164,7 @@ def test_drive_without_keyframes_has_no_map_points(tmp_path: Path) -> None:
 
 
 def peak_bytes_around(folder: Path) -> int:
-    """The most that bringing what lies beside this drive into the map holds at once."""
+    """Peak memory of transforming this drive's points into the map."""
     tracemalloc.start()
     try:
         write_around(folder)
@@ -214,7 +214,7 @@ def test_points_of_a_long_drive_are_transformed_in_chunks(tmp_path: Path, monkey
 
 
 def test_road_and_tracks_are_beside_the_trajectory_on_earth(tmp_path: Path) -> None:
-    """A line 2 m left of the way and a car 10 m ahead, by an odometry that bends away by metres."""
+    """A line 2 m to the left and a car 10 m ahead, with an odometry that drifts by metres."""
     true, nodes, _ = way(1500.0, seed=6)
     t_ns = [int(each) for each in times(len(nodes))]
     seen_from = [Place(t, 0, node.T_map_keyframe, node.T_map_keyframe) for t, node in zip(t_ns, nodes, strict=True)]

@@ -92,7 +92,7 @@ SCALE_ALONE = GraphConfig(correlated_direction_rad=0.0, correlated_turn_rel=0.0)
 
 
 def chain(steps: Iterable[SE2], scale_sigma_rel: float) -> list[Measurements]:
-    """A drive whose odometry states no noise of its own."""
+    """A drive whose odometry states no noise."""
     out = []
     for k, step in enumerate([SE2(), *steps]):
         cc = None
@@ -162,7 +162,7 @@ def test_scale_error_moves_all_bodies_alike() -> None:
             np.testing.assert_allclose(numbers(between_b), numbers(between_a), atol=1e-6)
 
 
-# --- where the world begins does not matter ---
+# --- invariance to the origin of the world ---
 
 
 def test_earlier_distance_does_not_affect_relative_poses() -> None:
@@ -241,7 +241,7 @@ def test_edge_may_start_at_any_pose_of_the_window() -> None:
     straight, estimates = run(world.measurements), run(forked)
     assert estimates[-1].epoch == 0
     np.testing.assert_allclose(off(estimates[10].T_world_ego, world.ego[10]), 0.0, atol=1e-9)
-    # What the way over frame 9 added is not in the pose that went past it, but the doubt about frame 7 still is
+    # The pose that skips frame 9 lacks its variance, but includes that of frame 7
     assert estimates[9].cov[0] > straight[7].cov[0]
     assert estimates[10].cov[0] < straight[10].cov[0]
 

@@ -95,7 +95,7 @@ def test_roll_is_estimated_from_cars_on_both_sides() -> None:
 
 
 def test_vehicles_on_another_street_give_no_false_roll() -> None:
-    """Three park aside on a street that lies higher; cars on the road itself are level."""
+    """Three cars park on a higher street beside the road; cars on the road itself are level."""
     rolls = []
     for sigma_rad in (CONFIG.sigma_common_crown_rad, 0.0):
         road = Road(config=replace(CONFIG, sigma_common_crown_rad=sigma_rad))
@@ -175,7 +175,7 @@ def test_outlier_lower_edge_moves_neither_road_nor_size() -> None:
     depths, _ = road.see(boxes)
     assert road.ground_size.ground.pitch_rad == pytest.approx(pitch_rad, abs=0.002)
     assert road.ground_size.size(0)[0] == pytest.approx(height_m, rel=0.05)
-    assert depths[0] == pytest.approx(14.0 - CAR.length_m / 2.0, rel=0.12)  # Eq. 1 says 30 % farther
+    assert depths[0] == pytest.approx(14.0 - CAR.length_m / 2.0, rel=0.12)  # Eq. 1 gives 30 % more
 
 
 def test_camera_pitch_moves_the_horizon_over_a_bump() -> None:
@@ -191,7 +191,7 @@ def test_camera_pitch_moves_the_horizon_over_a_bump() -> None:
 def test_pitch_from_images_is_used_once() -> None:
     ground_size = GroundSizeFilter(CAMERA, CONFIG)
     before = ground_size.sigma_pitch_rad
-    ground_size.predict(0.1, 0.0, CAMERA.ground, IMAGE_COV)  # the calibration says nothing new
+    ground_size.predict(0.1, 0.0, CAMERA.ground, IMAGE_COV)  # the calibration adds no information
     assert ground_size.sigma_pitch_rad >= before * 0.99
     ground_size.predict(0.1, 0.0, GroundPlane(CAMERA.height_m, 0.015), IMAGE_COV)
     assert ground_size.ground.pitch_rad == pytest.approx(0.015, abs=0.002)
@@ -262,7 +262,7 @@ def test_external_size_corrects_depth_and_is_not_stored() -> None:
 
 @pytest.mark.parametrize("speed_mps", [0.0, 15.0])
 def test_widening_box_means_turning_or_approaching_car(speed_mps: float) -> None:
-    """What stands shows no other side but by the ego's way, so that its width counts; who drives may turn."""
+    """The aspect of a stationary vehicle changes only by ego-motion, so its width counts; a moving one may turn."""
     road = Road()
     motion = LearnedSize(
         np.ones((1, 1)), np.full((1, 1), math.log(1.53)), np.full((1, 1), 1e6), np.full(1, speed_mps), NO_OUTLIERS

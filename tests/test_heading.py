@@ -66,7 +66,7 @@ def test_the_papers_point_is_the_same_for_every_yaw() -> None:
 
 
 def test_wide_box_is_a_crossing_car() -> None:
-    """Its centre lies half of its width behind the nearest face; one turned by 60 degrees looks nearly as wide."""
+    """Its centre is half of its width behind the nearest face; a car at 60 degrees looks nearly as wide."""
     truth = np.array([15.0, 0.0])
     seen, depth_m = car_at(truth, math.pi / 2.0, np.zeros(4))
     (centre, _), (mean, _) = placed(seen, depth_m, thought(0.0, 0.05, 0.25))
@@ -75,7 +75,7 @@ def test_wide_box_is_a_crossing_car() -> None:
 
 
 def test_covariance_covers_any_yaw() -> None:
-    """A quarter is headed anywhere, as `HeadingConfig` has it, and the place is told for one headed like the ego."""
+    """A quarter has any heading, as in `HeadingConfig`; the position assumes the ego's heading."""
     rng, squared = np.random.default_rng(2), []
     for _ in range(600):
         truth = np.array([rng.uniform(7.0, 20.0), 0.0])

@@ -97,7 +97,7 @@ def test_wait_is_limited_by_the_remaining_budget(made: Made, monkeypatch: pytest
             clock_ns[0] += 10**9
             networks.finish_frame()
         networks.start(Frame(9, 0, clock_ns[0], 0, None, (Status.FRAME_UNREADABLE,)))
-        networks.finish_frame()  # nothing was waited for: it says nothing
+        networks.finish_frame()  # without waiting there is no information
     assert waited_s == [0.1, 0.0]
 
 

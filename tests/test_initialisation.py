@@ -111,7 +111,7 @@ def test_guided_two_view_tolerates_far_and_wrong_matches() -> None:
 
 
 def test_features_with_reversed_parallax_do_not_affect_the_first_pose() -> None:
-    """They lie on the lines of the true motion, and no line tells them from the good: only the way along it does."""
+    """They satisfy the true epipolar constraint; only the direction along the line reveals them."""
     rng = np.random.default_rng(2)
     step = _step(0.4, 1.3)
     depth = np.concatenate([rng.uniform(6.0, 60.0, 90), rng.uniform(-30.0, -12.0, 60)])  # the last behind the camera
@@ -132,7 +132,7 @@ def test_features_with_reversed_parallax_do_not_affect_the_first_pose() -> None:
     ("changed", "found_m"),
     [
         ([[0.2, 0.1, 0.1], [0.2, 0.1, 0.7]], 2.0),  # behind a bonnet, or in a video whose encoder leaves asphalt still
-        ([[0.9, 0.5, 0.1], [0.9, 0.4, 0.1]], 0.05),  # a car that stands
+        ([[0.9, 0.5, 0.1], [0.9, 0.4, 0.1]], 0.05),  # a stationary car
         ([[0.2, 0.1, 0.1], [0.2, 0.1, 0.25]], 0.05),  # what may be chance
     ],
 )
@@ -211,7 +211,7 @@ def test_cold_starts_on_real_roads_have_the_right_scale(data_dir: Path) -> None:
 
 @pytest.mark.parametrize("pitch_deg", [0.0, 2.0])
 def test_a_wrong_pitch_of_the_camera_file_is_reported_on_a_bare_motorway(data_dir: Path, pitch_deg: float) -> None:
-    """The camera looks up by 0.95 degrees; reflections stand still on its windscreen."""
+    """The camera looks up by 0.95 degrees; its windscreen has fixed reflections."""
     path = data_dir / "highway" / "solidWhiteRight.mp4"
     if not path.is_file():
         pytest.skip(f"{path} is missing")

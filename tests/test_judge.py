@@ -74,7 +74,7 @@ def test_an_undisturbed_drive_is_valid_and_right(drive: list[Estimate]) -> None:
 
 
 def test_pose_jump_without_new_epoch_is_wrong(drive: list[Estimate]) -> None:
-    """At the end of the drive: marked valid, told as unsure, told as invalid."""
+    """At the end of the drive: marked valid, with a large covariance, marked invalid."""
     driven_m = (FRAMES - SETTLED) * street.FRAME_M
     jump = SE2(0.3 * driven_m + 5.0, 0.0, 0.0)
     last = msgspec.structs.replace(drive[-1], T_world_ego=drive[-1].T_world_ego @ jump)

@@ -23,7 +23,7 @@ POINTS = 700
 def unit_of_length(seed: int, way_m: float, sigma_px: float) -> Floats:
     """Estimated over true length of pieces of a straight street between points at both sides, seen with noise.
 
-    The first two poses are the true ones, and nothing tells the scale afterwards.
+    The first two poses are the true ones; afterwards the scale is not observable.
     """
     rng = np.random.default_rng(seed)
     side = rng.choice([-1.0, 1.0], POINTS)

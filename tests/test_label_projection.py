@@ -66,7 +66,7 @@ def test_labels_outside_the_image_are_truncated_or_dropped(tmp_path: Path) -> No
     assert (box[0], truncated) == (0.0, 1.0)
     assert seen(-40.0, 9.5) == []
     assert seen(0.0, -20.0) == []
-    ((box, truncated),) = seen(1.5, 1.0)  # beside the camera: half of it lies behind
+    ((box, truncated),) = seen(1.5, 1.0)  # beside the camera: half of it is behind
     assert truncated == 1.0
     assert box[2:] == (tracking_world.WIDTH_PX, tracking_world.HEIGHT_PX)
     assert all(map(math.isfinite, box))

@@ -136,7 +136,7 @@ def test_leaving_out_lanes_keeps_road_points() -> None:
 
 
 def test_station_and_road_point_with_equal_id_are_distinct() -> None:
-    """Told apart by their kind alone: the graph ties both, and says the same as with numbers of their own."""
+    """Distinguished only by kind: the graph uses both, with the same result as with different ids."""
 
     def estimates(station_id: int) -> list[Estimate]:
         graph, out = PoseGraph(GraphConfig(ego_nodes=1), ALL_EDGES), []

@@ -93,7 +93,7 @@ def picture(
     stripe_m: float = 0.14,
     vertical_per_m: float = 0.0,
 ) -> tuple[np.ndarray, Segmentation]:
-    """A grey road between edges at +-8 m with lines along world's x, and what a network says of it.
+    """A grey road between edges at +-8 m with lines along world's x, and its segmentation.
 
     It rises ahead of the ego by `vertical_per_m` x^2 / 2.
     """
@@ -486,7 +486,7 @@ def test_lane_probabilities_sum_to_one(x_m: float, y_m: float, sigma_m: float, y
 
 @given(st.lists(st.floats(-400.0, 400.0), max_size=3))
 def test_distant_users_are_in_no_lane(xs_m: list[float]) -> None:
-    """Also where nobody is nearer."""
+    """Also if no user is nearer."""
     lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0)
     users = [UserInEgo(k, SE2(x_m, 0.1, 0.0), np.eye(3) * 0.1, 4.0, 8.0) for k, x_m in enumerate(xs_m)]
     placed = with_users(lanes, users, 10.0, Traffic()).vehicles
@@ -568,7 +568,7 @@ def test_cyclists_can_be_leaders_and_pedestrians_cannot() -> None:
     cyclist = msgspec.structs.replace(walker, person=6, x_m=25.0, vx_mps=4.0, label="cyclist")
     found = with_users(lanes, [person_in_ego(walker), person_in_ego(cyclist)], 8.0, Traffic())
     assert [(place.vehicle, place.ego_lane > 0.9) for place in found.vehicles] == [(5, True), (6, True)]
-    assert found.vehicles[0].oncoming == 0.0  # who walks has no direction of traffic
+    assert found.vehicles[0].oncoming == 0.0  # pedestrians have no direction of traffic
     assert found.leader is not None
     assert found.leader.vehicle == 6
 

@@ -51,7 +51,7 @@ class Counted:
 
 
 class Elsewhere:
-    """Runs what it is given when it is told to."""
+    """Runs submitted work on request."""
 
     def __init__(self) -> None:
         self.waiting: list[tuple[Future[Any], Callable[..., Any], tuple[Any, ...]]] = []

@@ -46,7 +46,7 @@ def road_m(left_m: float, right_m: float) -> Floats:
 
 
 def drive(road: Floats, boundary: Floats, poses: list[SE2], complete: Completion | None = None) -> list[LaneCloud]:
-    """Each pose sees what lies 6 to 15 m before it."""
+    """Each pose observes 6 to 15 m ahead."""
     lanes = AmodalLanes(CONFIG, complete)
     for pose in poses:
         seen = [pose.inverse() @ points for points in (road, boundary)]
@@ -63,7 +63,7 @@ def test_each_line_is_a_lane_at_its_position() -> None:
     assert [np.median(lane.points_m[:, 1]) for lane in lanes] == pytest.approx([-3.6, 0.1, 3.4], abs=CONFIG.cell_m)
     assert len({lane.lane for lane in lanes}) == 3
     for lane in lanes:
-        assert lane.points_m[:, 0].min() < -5.0  # what was seen before lies behind now
+        assert lane.points_m[:, 0].min() < -5.0  # earlier observations are behind the ego
         assert lane.points_m[:, 0].max() > 13.0
 
 

@@ -63,7 +63,7 @@ def test_correlated_error_does_not_average_out() -> None:
     steady = {"change_forward_mps": 1e-3, "change_sideways_mps": 1e-3, "birth_forward_mps": 1e-2}
     config = GraphConfig(**steady, birth_sideways_mps=1e-2)
     floor = config.lasting_share * np.square(SIGMAS_M)
-    assert (variances(300, 0.0, config) > 0.95 * floor).all()  # an ego that stands sees the same for ever
+    assert (variances(300, 0.0, config) > 0.95 * floor).all()  # a stationary ego always observes the same
     driven, standing = (variances(40, mps, config) for mps in (10.0, 0.0))
     assert (driven < standing).all()  # new road, new errors
     assert (variances(300, 0.0, GraphConfig(**steady, birth_sideways_mps=1e-2, lasting_share=0.0)) < 0.1 * floor).all()

@@ -34,7 +34,7 @@ def box_of(x_m: float, y_m: float, ground: GroundPlane, height_m: float, edge_m:
 
 @pytest.mark.slow  # test_ground_size_filter.py has the law
 def test_sigma_includes_correlated_errors_after_many_frames() -> None:
-    """Cars are followed past, each with a height, a lower edge and a road of its own, which all its boxes share."""
+    """Tracks of passing cars, each with errors of height, lower edge and road that all its boxes share."""
     rng, squares = np.random.default_rng(5), {"young": [], "old": []}
     for _ in range(10):
         ground_size = GroundSizeFilter(CAMERA, CONFIG)
@@ -96,7 +96,7 @@ def test_lower_edge_is_not_learned_from_itself() -> None:
 
 @pytest.mark.parametrize("leap_m", [(4.5,), (3.0,), (2.2, 4.5)])
 def test_parked_car_with_a_neighbours_box_stays_stationary(leap_m: tuple[float, ...]) -> None:
-    """Whether it leaps by a car's length at once, by less, or a box of both lies between."""
+    """With a jump of a car's length, a smaller one, or an intermediate box that covers both."""
     ground_size = GroundSizeFilter(CAMERA, CONFIG)
     tracker = Tracker(CAMERA, TrackingConfig(), LOCALISATION, ground_size, PseudoLidarConfig())
     standing = []

@@ -84,7 +84,7 @@ class Drive:
         of_frame = {"slot": slot, "sequence": sequence, "ring_epoch": self._ring.epoch, "channels": 1}
         of_frame |= {"width_px": CAMERA.width_px, "height_px": CAMERA.height_px}
         times = {"t_source_ns": newest.t_source_ns, "t_utc_ns": 0}
-        far_ns = self._began_ns + number * 10**12  # whatever the budget says
+        far_ns = self._began_ns + number * 10**12  # regardless of the budget
         self._topics.frame.put(FrameRef(frame_id=newest.frame_id, t_capture_ns=far_ns, **times, **of_frame))
         if of_image is not None:
             self._topics.estimate.put(of_image)

@@ -14,7 +14,7 @@ SUITE = """
 import signal, subprocess
 from tests.leftovers import end_with_this_process
 watcher = end_with_this_process()
-# As a vehicle: a session of its own, whose process starts others
+# Like a vehicle: a new session, whose process starts others
 command = ["sh", "-c", "sleep 600 & echo $!; sleep 600"]
 vehicle = subprocess.Popen(command, stdout=subprocess.PIPE, start_new_session=True, text=True)
 print(vehicle.pid, vehicle.stdout.readline().strip(), watcher, flush=True)

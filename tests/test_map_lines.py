@@ -62,7 +62,7 @@ def mapped() -> bytes:
 
 
 def aside_m(place_map: PlaceMap, line: int) -> np.ndarray:
-    """By how much the map's line lies beside the way between keyframes, to their left."""
+    """Lateral distance of the map's line from the trajectory between keyframes, positive to the left."""
     out = []
     for each in place_map.lines():
         if each.line == line:

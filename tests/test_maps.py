@@ -52,7 +52,7 @@ def session(place_map: PlaceMap, extend: bool) -> MapSession:
 def driven(
     place_map: PlaceMap, street: Street, rows: range, extend: bool = False, seed: int = 1, **how: float
 ) -> list[tuple[Localisation, SE2]]:
-    """What the session says of each frame, and where the ego truly is in the frame of the route."""
+    """The session's result for each frame, and the true ego pose in the frame of the route."""
     running = session(place_map, extend)
     out = [
         (running.step(estimate, seen), T)  # type: ignore[arg-type]
@@ -164,7 +164,7 @@ def test_new_map_starts_with_the_first_valid_frame() -> None:
 
 
 def test_failed_queries_end_localisation(mapped: bytes) -> None:
-    """In a mapped street, by an odometry that has left it: frames that nobody looked at count for nothing."""
+    """In a mapped street, with an odometry that has drifted off: skipped frames do not count."""
     states: dict[bool, list[MapState]] = {True: [], False: []}
     for looked in states:
         running = session(decode_map(mapped), extend=False)
@@ -179,7 +179,7 @@ def test_failed_queries_end_localisation(mapped: bytes) -> None:
 
 
 def test_near_points_correct_a_wrong_guess(mapped: bytes) -> None:
-    """A guess that is turned about what lies far ahead, where half of the matches are wrong."""
+    """A guess rotated about far points, with half of the matches wrong."""
     place_map, chance = decode_map(mapped), np.random.default_rng(2)
     T = SE2(*(float(number) for number in STREET.route[40]))
     seen = STREET.see(T, chance)
@@ -224,7 +224,7 @@ def test_far_points_give_the_most_likely_pose_not_the_guess(mapped: bytes, wrong
 
 
 def test_uncertain_depths_do_not_bias_lateral_offset(mapped: bytes) -> None:
-    """Errors in variables attenuate a slope: by depths that err by 6 % who is 3 m aside seemed to be .08 m less so."""
+    """Errors in variables attenuate a slope, here the lateral offset with depth errors of 6 %."""
     chance, T, keyframe = np.random.default_rng(3), SE2(0.0, -3.0, 0.0), decode_map(mapped).keyframes[0]
     off, sigma, most_m = [], [], (40.0, 12.0, 5.0)
     for _ in range(60):
@@ -371,7 +371,7 @@ def test_rejected_loops_do_not_move_keyframes() -> None:
     far = [Link(first.number, last.number, SE2(1e4 * sign, 5.0, 0.5), cov, loop=True) for sign in (1.0, -1.0)]
     at, at_cov, _ = close_loops(place_map.keyframes, [*links, *far])[last.number]
     assert np.hypot(*last.T_map_keyframe.between(at).log()[:2]) < 1.0
-    assert at_cov[0, 0] > 1e3  # nothing says where it is
+    assert at_cov[0, 0] > 1e3  # its position is unknown
 
 
 def test_loop_closure_corrects_drift_of_carried_scale() -> None:
@@ -495,7 +495,7 @@ def test_frames_before_confirmation_are_localised_afterwards(mapped: bytes, tmp_
 
 
 def test_no_backward_localisation_over_invalid_odometry(mapped: bytes) -> None:
-    """A step of 1 m that no odometry measured: what it says of its length is nothing."""
+    """A step of 1 m without measured length."""
     running, trajectory = session(decode_map(mapped), extend=False), MapTrajectory()
     rows = []
     for number, (estimate, seen, _) in enumerate(drive(STREET, range(20, 50), 3)):

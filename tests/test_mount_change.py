@@ -43,7 +43,7 @@ def detect(
 
 @pytest.mark.slow
 def test_normal_roads_raise_no_alarm() -> None:
-    """40 drives of 1.5 km; the file is off by what its sigma says."""
+    """40 drives of 1.5 km; the file's error matches its sigma."""
     alarms = 0
     for seed in range(40):
         tilts = way(1500.0, seed)

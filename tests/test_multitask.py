@@ -129,7 +129,7 @@ def world(cam: Camera, *bodies: WorldObject) -> WorldFrame:
 
 
 def perfect_answer(example: Example) -> dict[str, NDArray[np.float32]]:
-    """What a network that has learnt everything says of an example."""
+    """The outputs of a perfect network for an example."""
     out = {name: np.zeros(shape, dtype=np.float32) for name, shape in SHAPES.items()}
     out["segmentation"][0] = 8.0 * (2.0 * example.masks - 1.0)
     out["depth"][0, 0] = example.log_depth
@@ -525,7 +525,7 @@ def test_context_block_starts_as_identity() -> None:
     image = torch.rand(1, 3, 64, 128).numpy() * 2.0 - 1.0
     for name, answer in before.answer(image).items():
         np.testing.assert_allclose(after.answer(image)[name], answer, rtol=1.3e-6, atol=1e-5)
-    # What lies outside of a cell's own view counts once the new blocks have learnt anything
+    # Pixels outside of a cell's receptive field matter after training of the new blocks
     torch.nn.init.ones_(after.average.module.context[0].norm.weight)
     assert not np.array_equal(after.answer(image)["depth"], before.answer(image)["depth"])
     with pytest.raises(ValueError, match="context"):

@@ -142,7 +142,7 @@ def test_new_pattern_restarts_the_mean_image() -> None:
 
 
 def road_image(rng: np.random.Generator) -> np.ndarray:
-    """(H, W) a road whose grain is another one in each image, and two lines of the lane that stand."""
+    """(H, W) a road with new texture in each image, and two fixed lane lines."""
     grain = cv2.GaussianBlur(rng.normal(0.0, 40.0, (192, 640)), (0, 0), 1.5)
     image = np.clip(110.0 + grain, 0, 255).astype(np.uint8)
     for x in (60, 600):

@@ -73,7 +73,7 @@ def render(pose: Pose, noise_seed: int = 0) -> np.ndarray:
     return _rendered(pose.R.tobytes(), pose.p.tobytes(), noise_seed).copy()
 
 
-@functools.lru_cache(maxsize=256)  # many drives begin alike
+@functools.lru_cache(maxsize=256)  # a common start of drives
 def _rendered(R: bytes, p_m: bytes, noise_seed: int) -> np.ndarray:
     pose = Pose(np.frombuffer(R).reshape(3, 3), np.frombuffer(p_m))
     v, u = np.mgrid[0:HEIGHT_PX, 0:WIDTH_PX].astype(np.float64)
@@ -240,7 +240,7 @@ def test_stopping_car_creeps_before_standstill() -> None:
             told.append(motion.standstill)
     assert len(off) > 40
     assert not any(told)
-    assert np.sqrt(np.mean(np.square(off))) < 1.5  # an image in which nothing moved says how far the car may have gone
+    assert np.sqrt(np.mean(np.square(off))) < 1.5  # an unchanged image bounds the motion
 
 
 def test_turning_on_the_spot_does_not_travel() -> None:
@@ -296,7 +296,7 @@ def test_without_features_odometry_coasts_and_restarts() -> None:
 
 
 def test_bump_at_a_restart_is_not_a_mount_change() -> None:
-    """The first direction of a drive may say that the camera file's pitch is wrong; of a later window it may not."""
+    """Only the first window of a drive may reveal a wrong pitch of the camera file."""
     truth = [
         Pose(pose.R, pose.p - [0.0, 0.04 if k >= 23 else 0.0, 0.0]) for k, pose in enumerate(street([(0.7, 0.0)] * 28))
     ]
@@ -370,7 +370,7 @@ def test_hidden_road_carries_the_scale_with_status() -> None:
 
 
 def test_repeated_contradiction_counts_once() -> None:
-    """A dark that travels with the car, and has the grain of a road, lies on the road: for 0.4 m, then 12 m more."""
+    """A textured shadow that moves with the car is on the road: for 0.4 m, then 12 m more."""
     steps = [(0.35, 0.0)] * 36 + [(0.03, 0.0)] * 14 + [(0.35, 0.0)] * 36
     truth = street(steps)
     grain = 2.5 * cv2.resize(np.random.default_rng(5).normal(size=(30, 100)), (400, 90), interpolation=cv2.INTER_CUBIC)
@@ -403,7 +403,7 @@ def test_late_masks_change_length_within_sigma(seed: int) -> None:
         masks.append((d[..., 1] > 1e-2) & (np.abs(aside_m) < 3.0))
 
     def driven(late: list[np.ndarray | None]) -> tuple[float, float]:
-        """The length in metres and its relative sigma, as told at the end."""
+        """The length in metres and its relative sigma at the end."""
         odometry, steps, sigma_rel = Odometry(CAMERA), [], 1.0
         for k, (image, mask) in enumerate(zip(images, late, strict=True)):
             motion = odometry.estimate(odometry.track(image), k, int(k * 1e9 / 33.0), NO_BOXES, mask)

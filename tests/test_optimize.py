@@ -79,7 +79,7 @@ def _alone() -> list[Estimate]:
 
 
 def alone(frames: int) -> list[Estimate]:
-    """What the graph says of the drive's first frames where all come in time."""
+    """The graph's estimates of the first frames if all measurements arrive in time."""
     return _alone()[:frames]
 
 
@@ -168,7 +168,7 @@ def test_late_measurements_correct_the_published_estimate(tmp_path: Path) -> Non
         estimates(node, record)
     goal = alone(14)
     (guessed,) = estimates(node, Overdue(ref(12)))
-    (better,) = estimates(node, DRIVE[10])  # two frames behind: of the newest that was told, from where this one is
+    (better,) = estimates(node, DRIVE[10])  # two frames late: relative to the newest published frame
     assert (guessed.frame_id, better.frame_id) == (12, 12)
     assert Status.PERCEPTION_LATE in better.status
     step, passed_ns = DRIVE[10].cc, DRIVE[10].t_source_ns - DRIVE[9].t_source_ns
@@ -211,7 +211,7 @@ def test_published_frame_numbers_never_fall(lateness: list[int], seed: int) -> N
 
 
 def after(frame_id: int) -> Assignment:
-    """What the next process is told when that frame was the last one sent."""
+    """The input of the next process if that frame was the last one sent."""
     return Assignment(1, "was killed by SIGKILL", Resume(frame_id + 1, 0, 0))
 
 

@@ -71,7 +71,7 @@ def open_frame(k: int) -> OpenFrame:
 
 
 def follow(used: list[int | None], noise_px: float = 0.5) -> tuple[list[tuple[float, ...]], list[GroundPlane]]:
-    """What is seen when frame k knows the detections of frame used[k], and the road under the camera in each frame."""
+    """Observations if frame k has the detections of frame used[k], and the road under the camera in each frame."""
     vehicles, seen, roads = out_of_sequence(), [], []
     for k, source in enumerate(used):
         vehicles.open_frame(open_frame(k))

@@ -106,7 +106,7 @@ def test_each_edge_adds_exactly_its_lambda() -> None:
 
 
 def test_cc_cv_and_vv_are_the_batch_of_the_papers_edges() -> None:
-    """gtsam's marginals on a log that also tells of standstill and a scale that errs, to which the batch is deaf."""
+    """gtsam's marginals on a log with standstill and a scale error, which the batch ignores."""
     log = told_of_more(drive(replace(EXACT, landmarks=0), 2))
     estimate = run(log)[-1]
     batch = solve(log, GraphConfig(constant_velocity=False), PAPER.weights)
@@ -121,7 +121,7 @@ def test_cc_cv_and_vv_are_the_batch_of_the_papers_edges() -> None:
 
 
 def test_landmark_is_fixed_at_first_observation() -> None:
-    """Without noise but for one step of the ego that is told 0.5 m too long: a landmark seen before and after it takes
+    """Without noise except for one ego step 0.5 m too long: a landmark seen before and after it takes
     the ego back by the share of its weight, and so do the frames after, since X_p of Eq. 3 moves with none of them."""
     log = drive(replace(EXACT, vehicles=0, landmarks=0), 2).measurements
     poses = [SE2()]

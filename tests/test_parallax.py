@@ -39,7 +39,7 @@ def measured(at: np.ndarray, height_m: float, noise: np.ndarray) -> ParallaxMeas
 
 
 class Road:
-    """An ego that drives on at `ego_mps` and one vehicle, at `centre_m` in world, which moves by `mps` (2,)."""
+    """An ego at `ego_mps` and one vehicle at `centre_m` in world with velocity `mps` (2,)."""
 
     def __init__(
         self,
@@ -73,7 +73,7 @@ class Road:
         return learned
 
     def height(self, learned: LearnedSize) -> float:
-        """The mean over all that may be, with what the class says."""
+        """The posterior mean with the class prior."""
         information = 1.0 / learned.variance + 1.0 / SIGMAS[0] ** 2
         each = (learned.log_height / learned.variance + math.log(CLASS_M) / SIGMAS[0] ** 2) / information
         return math.exp(float((learned.weight * each).sum()))
@@ -119,7 +119,7 @@ def test_no_size_is_learned_straight_ahead(
 @pytest.mark.parametrize("height_m", [1.53, 1.65, 1.75])
 @pytest.mark.parametrize(("mps", "stands"), [(0.0, True), (2.0, False), (3.0, False), (-3.0, False)])
 def test_slow_queue_is_not_taken_for_tall_stationary_cars(height_m: float, mps: float, stands: bool) -> None:
-    """It grows slower than what stands, as a taller car would; its class and the ground say that it is none."""
+    """Its box grows like that of a taller stationary car; class and ground exclude this."""
     road = Road(height_m, x_m=45.0, ego_mps=8.0)
     road.parallax = Parallax(ParallaxConfig())  # errors last, so that few frames count
     road.drive(4.0 if mps >= 0.0 else 1.5, (mps, 0.0), noisy=False)
@@ -128,7 +128,7 @@ def test_slow_queue_is_not_taken_for_tall_stationary_cars(height_m: float, mps: 
 
 
 def test_far_beside_the_road_constant_bearing_means_stationary() -> None:
-    """There nothing says in which direction it would drive, so that its standing still shows sooner."""
+    """Without a direction of traffic, standstill is found sooner."""
     aside = Road(1.53, x_m=60.0, y_m=20.0)
     aside.drive(1.5)
     beside = Road(1.53, x_m=60.0, y_m=4.0)

@@ -195,7 +195,7 @@ def test_near_people_give_heights_and_far_people_the_tilt() -> None:
 
 
 def test_people_follow_the_vertical_curvature() -> None:
-    """A sag as the lanes tell it: over its plane the feet would lie 4 m too far."""
+    """A sag known from the lanes: on the plane the feet would be 4 m too far."""
     bend, x_m = 2e-3, 30.0
     box = box_of(x_m, 1.0, rise=bev.rise(x_m - 0.25, bend))
     bent = GroundSizeFilter(CAMERA, GroundSizeConfig())
@@ -250,7 +250,7 @@ def test_covariances_are_consistent_with_boxes_and_heights() -> None:
 
 @pytest.mark.parametrize(("walks_mps", "seed"), [(1.5, 0), (1.5, 1), (-1.2, 0), (-1.2, 1)])
 def test_walker_beside_a_moving_ego_is_not_stationary(walks_mps: float, seed: int) -> None:
-    """Boxes whose error lasts are evidence of one: else whoever expects least, who stands, wins by being repeated."""
+    """Correlated box errors count once; otherwise repetition would favour the stationary hypothesis."""
     rng, scene, error, told = np.random.default_rng(seed), Scene(ego_mps=6.0), np.zeros(4), list[float]()
     while (x_m := 27.0 + walks_mps * scene.k / HZ - scene.ego_m) > 8.0:
         box = np.array(box_of(x_m, 3.0, 1.65))

@@ -48,7 +48,7 @@ def decoder() -> YoloxDecoder:
 
 
 def encode(boxes_px: NDArray[np.float64], classes: Sequence[int], scores: Any) -> dict[str, NDArray[np.float32]]:
-    """The YOLOX output that holds boxes (N, 4) of the input; each at a cell of its own."""
+    """The YOLOX output for boxes (N, 4) of the input, one per cell."""
     raw = np.zeros((CELLS, 9), np.float32)
     first = np.cumsum([0, *[(SIZE_PX // s) ** 2 for s in STRIDES]])
     for index, (box, label, score) in enumerate(zip(boxes_px, classes, scores, strict=True)):
@@ -205,7 +205,7 @@ WIDE = (1240, 376)
 
 
 def seen_on_tiles(objects: NDArray[np.float64], tiles: Tiles, scores: Any) -> Detections:
-    """What an ideal detector, which sees in each tile the part of the object that lies there, makes of cars."""
+    """Detections of an ideal detector, which sees in each tile the part of the object inside it."""
     reader, entry = decoder(), square_input()
     views = make_views(*WIDE, entry, tiles)
     parts = []

@@ -78,7 +78,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Run:
-    """`birdslam run` in a process of its own."""
+    """`birdslam run` in a separate process."""
 
     def __init__(self, place: Path, *arguments: str, vehicle: str = "test") -> None:
         self.place, self.vehicle = place, vehicle
@@ -167,7 +167,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def wait_gone(pids: list[int]) -> None:
-    """Until none of the processes is left."""
+    """Waits until all processes have ended."""
     for pid in pids:
         try:
             fd = os.pidfd_open(pid)
@@ -399,7 +399,7 @@ def test_user_errors_are_named_before_start(
 
 
 def refused(drive: Path, place: Path, capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
-    """Exit status and what was said of a run that can't begin, and left nothing behind."""
+    """Exit status and output of a run that cannot start and leaves nothing behind."""
     status = main(
         [
             *("run", "--vehicle", "test", "--source", f"kitti:{drive}", "--output", str(place / "out")),
@@ -440,7 +440,7 @@ def test_killed_capture_resumes_until_it_fails_too_often(drive: Path, place: Pat
             while after is None or after.t_capture_ns < t_killed_ns:
                 after = planner.wait(LIMIT_S)
             frames, time_ns = after.frame_id - before.frame_id, after.t_source_ns - before.t_source_ns
-            assert frames >= 2  # the number left out tells perceive of the gap
+            assert frames >= 2  # the missing number reveals the gap to perceive
             assert time_ns == pytest.approx(frames * 100_000_000, abs=1000)
         os.kill(run.node_pid("capture"), signal.SIGKILL)
         status, out, err = run.end()

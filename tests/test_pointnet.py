@@ -181,6 +181,6 @@ def test_rotated_and_centred_points_round_trip(slope: float, z_m: float) -> None
     assert (back[:, 2] < z_m + 1.0).all()
     assert np.abs(frustum.features[3:5]).max() <= 1.0 + 1e-6
     np.testing.assert_allclose(frustum.features[5], math.log(z_m / 20.0), atol=1e-6)
-    # The box's middle lies straight ahead of the turned camera
+    # The box's middle is straight ahead of the rotated camera
     slopes = points[:, 0] / points[:, 2]
     assert math.tan(frustum.azimuth_rad) == pytest.approx((slopes.min() + slopes.max()) / 2.0)

@@ -67,7 +67,7 @@ def test_moving_feature_is_not_a_point() -> None:
 
 
 def read_colmap(model: Path) -> tuple[list[float], dict[str, tuple[np.ndarray, np.ndarray]], dict[int, np.ndarray]]:
-    """Intrinsics, T_cam_world and (N, 3) x, y, point id of each image, points by id: as COLMAP's documentation says."""
+    """Intrinsics, T_cam_world and (N, 3) x, y, point id of each image, points by id, by COLMAP's documentation."""
 
     def rows(name: str) -> list[list[str]]:
         lines = (model / name).read_text().splitlines()

@@ -26,7 +26,7 @@ IMAGE = np.random.default_rng(1).integers(0, 255, (96, 160, 3), np.uint8)
 ABSENT = next(name for name in ("tensorrt", "cuda", "openvino") if name not in session.providers_here())
 
 
-stand_in = pytest.mark.filterwarnings("ignore:Duplicate provider")  # the CPU as one that begins anywhere
+stand_in = pytest.mark.filterwarnings("ignore:Duplicate provider")  # the CPU as a provider that always starts
 
 
 def by(provider: str | None) -> ModelSpec:

@@ -29,7 +29,7 @@ CAR = LOCALISATION.vehicles["car"]
 
 
 def scene(poses: list[SE2], cells: tuple[int, int] = (96, 320)) -> tuple[DepthMap, NDArray[np.float64]]:
-    """The exact depth of cuboid cars on a flat road, and their boxes; an oracle of its own (slabs in three axes)."""
+    """The exact depth of cuboid cars on a flat road, and their boxes, by ray casting (slabs in three axes)."""
     height, width = cells
     u = (np.arange(width) + 0.5) * CAMERA.width_px / width - 0.5
     v = (np.arange(height) + 0.5) * CAMERA.height_px / height - 0.5
@@ -182,7 +182,7 @@ def test_network_gets_boxes_with_points_and_gives_poses_in_ego() -> None:
     assert near.yaw_rad == pytest.approx(0.4)
     assert (near.flip, near.size_m) == (0.05, (CAR.length_m, CAR.width_m, CAR.height_m))
     depth_m = network.bodies.depth_m[0] if network.bodies is not None else math.nan
-    assert near.cov[0, 0] == pytest.approx(0.5**2 + (0.05 * depth_m) ** 2)  # what it says, and what the map is worth
+    assert near.cov[0, 0] == pytest.approx(0.5**2 + (0.05 * depth_m) ** 2)  # its sigma and that of the map
     # One that gives no numbers leaves the fit
     fallback = locate_in_depth_map(observed(boxes), depth, CAMERA, CAMERA.ground, config, network=Told(None))
     assert fallback[0] is not None

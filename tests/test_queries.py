@@ -44,7 +44,7 @@ def test_last_messages_are_retained(join: Any) -> None:
     join("supervisor", hub=True)
     perceive = join("perceive")
     out = perceive.publisher("measurements")
-    for number in range(TOPICS["measurements"].retained + 5):  # and nobody listens
+    for number in range(TOPICS["measurements"].retained + 5):  # without subscriber
         out.put(measurements(number))
     optimize = join("optimize")
     perceive.declare_alive()
@@ -52,7 +52,7 @@ def test_last_messages_are_retained(join: Any) -> None:
     kept = optimize.retained("measurements")
     assert [message.record.frame_id for message in kept] == list(range(5, TOPICS["measurements"].retained + 5))
     assert [message.trace.stages[-1].node for message in kept] == ["perceive"] * len(kept)
-    assert optimize.retained("estimate", timeout_s=0.2) == []  # nobody sends them
+    assert optimize.retained("estimate", timeout_s=0.2) == []  # never sent
 
 
 def test_late_planner_gets_the_last_estimate(join: Any, base: Path) -> None:
@@ -215,7 +215,7 @@ def test_flood_of_queries_does_no_harm(join: Any, base: Path) -> None:
         return trajectory_parts(way)
 
     hub.answer_queries({"trajectory": answer})
-    hub.publisher("estimate").put(estimate(1))  # is kept, and told on the thread on which queries come
+    hub.publisher("estimate").put(estimate(1))  # is kept, and raised on the query thread
     with foreign_session(base) as foreign, Planner("car", base) as planner:
 
         def ask(topic: str) -> Any:

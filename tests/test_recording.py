@@ -143,7 +143,7 @@ def check_simple(part: dict[str, Any]) -> None:
 
 
 def fits(value: Any, part: dict[str, Any]) -> bool:
-    """Whether a message is what its schema says."""
+    """Whether a message fits its schema."""
     if part["type"] == "object":
         fields = part["properties"]
         if not fields:
@@ -175,7 +175,7 @@ def test_truncated_recording_is_read_up_to_the_end(tape: Tape) -> None:
     with tape.path.open("rb") as file:
         summary = make_reader(file).get_summary()
     assert summary is not None
-    first_chunk = summary.chunk_indexes[0].chunk_start_offset  # before it stands what the recording is about
+    first_chunk = summary.chunk_indexes[0].chunk_start_offset  # preceded by the header
     all_of_it = messages(tape.path)
     lengths = []
     for size in [*range(0, len(whole), len(whole) // 60), len(whole) - 1]:

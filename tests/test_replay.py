@@ -85,7 +85,7 @@ def test_frames_that_were_coasted_over_and_measurements_that_came_too_late(tmp_p
     first, second = tape.frame(frames[10]), tape.frame(frames[11])
     tape.coast(first)
     tape.coast(second)
-    tape.take(tape.send(frames[10]))  # late: the newest frame is told of again
+    tape.take(tape.send(frames[10]))  # late: the newest frame is published again
     tape.take(tape.send(frames[11]))
     for measurements in frames[12:]:
         tape.step(measurements)
@@ -265,7 +265,7 @@ def test_new_epoch_with_lost_first_estimate_is_not_a_difference(tmp_path: Path, 
 def test_an_epoch_that_began_in_a_process_killed_before_its_estimates_left(
     tmp_path: Path, lost: int, dead: int
 ) -> None:
-    """The next process goes on from the checkpoint of an epoch that nobody has heard of."""
+    """The next process restores the checkpoint of an unpublished epoch."""
     tape, frames = Tape(tmp_path), iter(measured(40))
     for measurements in itertools.islice(frames, 10):
         tape.step(measurements)

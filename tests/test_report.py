@@ -36,7 +36,7 @@ EVIL = "</script><script>document.title='broken'</script>"
 
 @pytest.fixture
 def results(tmp_path: Path) -> Path:
-    """A drive of 60 frames at 10 Hz and 5 m/s: it begins without a scale, and restarts at frame 40."""
+    """A drive of 60 frames at 10 Hz and 5 m/s: it starts without a scale, and restarts at frame 40."""
     directory = tmp_path / "drive & <b>way"
     with Recorder(directory, CAMERA) as recorder:
         for k in range(FRAMES):
@@ -105,7 +105,7 @@ def test_the_drive_is_read_back_in_one_plane(results: Path) -> None:
     drive = read_drive(results)
     assert drive.frame.tolist() == list(range(FRAMES))
     assert np.diff(drive.xy_m[:, 0])[: RESET - 1] == pytest.approx(0.5, abs=1e-6)
-    assert drive.xy_m[RESET, 0] == pytest.approx(drive.xy_m[RESET - 1, 0])  # begins where the other was left
+    assert drive.xy_m[RESET, 0] == pytest.approx(drive.xy_m[RESET - 1, 0])  # starts at the end of the other
     assert drive.xy_m[-1, 0] == pytest.approx(0.5 * (FRAMES - 2), abs=1e-6)
     assert np.isnan(drive.speed_mps[[0, RESET]]).all()
     assert np.delete(drive.speed_mps, [0, RESET]) == pytest.approx(5.0, abs=0.01)

@@ -21,7 +21,7 @@ GRADE = 0.06
 
 
 def camera_pose(stand: Stand) -> Pose:
-    """In axes x right, y down, z along the way."""
+    """In axes x right, y down, z forward."""
     return Pose(rotation_exp(np.array([-stand.pitch_rad, 0.0, 0.0])), np.array([0.0, -stand.up_m, stand.way_m]))
 
 
@@ -43,7 +43,7 @@ def compared(rear_m: float, ahead_rad: float) -> RoadFit:
     ("rears_m", "curvature_per_m"), [((28.0, 30.0), GRADE / CURVE_M), ((105.0, 110.0, 115.0, 120.0), -GRADE / CURVE_M)]
 )
 def test_image_comparison_distinguishes_sag_and_crest(rears_m: tuple[float, ...], curvature_per_m: float) -> None:
-    """One pair of images knows it to half of itself at best."""
+    """One pair of images determines it to 50 % at best."""
     seen = [float(compared(rear_m, 7.5 * curvature_per_m).state[3]) for rear_m in rears_m]
     assert 0.5 < np.mean(seen) / curvature_per_m < 2.0
 
@@ -96,7 +96,7 @@ def test_correlated_feature_errors_keep_the_tilt_uncertain() -> None:
 
 
 def _of_the_length(sigma_log: float) -> RoadFit:
-    """An alignment that knows the tilt and the length to `sigma_log`."""
+    """An alignment with sigma `sigma_log` of tilt and length."""
     return RoadFit(np.zeros(4), np.diag([sigma_log**2, 1e-6, 1e-6, 1e-8]), 0.9, 1000)
 
 
@@ -126,7 +126,7 @@ def test_weak_alignments_add_up_consistently() -> None:
 
 
 def test_unknown_tilt_hides_the_scale() -> None:
-    """The same alignment, of a steep trade of length against pitch: it tells the length where the pitch is known."""
+    """The same alignment with strongly correlated length and pitch: it gives the length if the pitch is known."""
     steep = np.array([1.0, 0.1, 0.0, 0.0])  # a tenth of a radian of pitch for all of the length
     fit = RoadFit(np.zeros(4), np.diag([1e-4, 1e-6, 1e-6, 1e-8]) + np.outer(steep, steep), 0.9, 1000)
     unsure, sure = RoadFilter(CAMERA, RoadScaleConfig()), RoadFilter(CAMERA, RoadScaleConfig())
@@ -135,7 +135,7 @@ def test_unknown_tilt_hides_the_scale() -> None:
 
 
 def test_sigma_of_carried_scale_grows() -> None:
-    """Its errors go together: twice the way is more than the root of two of the sigma."""
+    """Its errors are correlated: twice the distance has more than sqrt(2) times the sigma."""
     sigma_rel = []
     for metres in (100, 200):
         filter_ = RoadFilter(CAMERA, RoadScaleConfig())

@@ -93,7 +93,7 @@ def test_cold_starts_on_coarsely_encoded_motorways_have_the_right_scale() -> Non
 
 
 def told_obstructed(drive: Drive) -> list[bool]:
-    """Of each motion from the middle on, where what comes has come: whether something on the glass is told of."""
+    """Whether each motion from the middle on reports an obstruction."""
     _, motions = follow(drive, range(len(drive.images)))
     return [Status.VIEW_OBSTRUCTED in motion.status for motion in motions if motion.to_frame > len(drive.images) // 2]
 

@@ -101,7 +101,7 @@ def matrix(pose: Any) -> np.ndarray:
     return out
 
 
-# The last world begins where the one before ended
+# The last epoch starts at the end of the one before
 IN_ODOM = [
     SE2(),
     SE2(1.0, 0.5, 0.4),

@@ -1,6 +1,6 @@
 """ROS 2 live: names and bytes beside those of an independent implementation, and messages both ways through a router.
 
-The counterpart is the package zenoh-ros2-sdk, in a process of its own. A real rmw_zenoh was not at hand.
+The counterpart is the package zenoh-ros2-sdk in a separate process, not a real rmw_zenoh.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ def test_hashes_are_those_of_the_other_implementation(name: str, tmp_path: Path)
 
 
 class Cdr:
-    """Reads little-endian CDR (XCDR1) by itself: a value lies at a multiple of its size, after four bytes of head."""
+    """Reads little-endian CDR (XCDR1): values are aligned to their size, after a header of four bytes."""
 
     def __init__(self, data: bytes) -> None:
         assert data[:4] == b"\0\1\0\0"
@@ -299,7 +299,7 @@ class Listener:
         return self
 
     def __exit__(self, *failure: object) -> None:
-        """The process ends, and with it what it says, before anybody closes the pipe."""
+        """Ends the process and its output before the pipe is closed."""
         self._process.kill()
         self._thread.join()
 
@@ -350,7 +350,7 @@ def topics(*names: str, namespace: str = "") -> list[str]:
 
 
 def states(listener: Listener) -> Counter[str]:
-    """How often the diagnostics said what."""
+    """Counts of the diagnostics' messages."""
     return Counter(message["status"][0]["message"] for message in listener.of("/diagnostics"))
 
 

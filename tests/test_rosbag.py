@@ -180,7 +180,7 @@ def test_camera_info(info: object, rectified: bool, expected: tuple[float, float
 
 @pytest.mark.parametrize("fisheye", [False, True])
 def test_distorted_image_is_undistorted(fisheye: bool) -> None:
-    """A grid of world points, seen through the lens, lies where the pinhole has it after undistortion."""
+    """A grid of world points seen through the lens is at its pinhole projection after undistortion."""
     coefficients = (0.05, -0.01, 0.002, -0.001) if fisheye else (-0.25, 0.08, 0.001, -0.002, 0.0)
     camera = Camera(640, 480, 300.0, 305.0, 322.0, 238.0, 1.5, distortion=coefficients, fisheye=fisheye)
     rays = np.array([[x, y, 1.0] for x in (-0.5, 0.0, 0.4) for y in (-0.3, 0.25)])
@@ -271,7 +271,7 @@ def test_the_speed_of_the_car(tmp_path: Path) -> None:
     frames = list(open_recording(uri, topics=BagTopics(speed="/speed")).frames_with_speeds())
     assert [frame.speeds[-1].speed_mps for frame in frames] == [3.0, 4.0, 5.0, 6.0, 7.0, 8.0]
     assert frames[3].speeds[-1].t_ns == frames[3].t_source_ns
-    assert {(r.sigma_mps, r.yaw_rate_radps) for r in frames[-1].speeds} == {(0.1, None)}  # it never said that it turns
+    assert {(r.sigma_mps, r.yaw_rate_radps) for r in frames[-1].speeds} == {(0.1, None)}  # without yaw rate
     (reading,) = next(open_recording(uri, topics=BagTopics(speed="/wheels")).frames_with_speeds()).speeds
     assert (reading.speed_mps, reading.sigma_mps) == (7.0, pytest.approx(0.2))
 

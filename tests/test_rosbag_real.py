@@ -79,7 +79,7 @@ def estimates(recording: Recording, count: int) -> list[bytes]:
 
 
 def small_drive(folder: Path, data_dir: Path, count: int, width: int = 310) -> KittiRecording:
-    """The first frames of a real drive, a quarter as wide, as a KITTI drive of its own."""
+    """The first frames of a real drive, a quarter as wide, as a separate KITTI drive."""
     drive = KittiRecording(data_dir / "kitti_tracking" / "training" / "image_03" / "0005")
     scale = width / drive.camera.width_px
     images = folder / "image_02" / "0005"
@@ -113,7 +113,7 @@ def test_a_few_small_frames_come_to_the_method_as_from_files(
 def test_a_real_drive_gives_the_same_bytes_from_every_bag(
     tmp_path: Path, data_dir: Path, lens: tuple[float, ...]
 ) -> None:
-    """Distorted: the same images, said to be distorted by the bag's CameraInfo and by a camera file."""
+    """The same images, declared distorted by the bag's CameraInfo and by a camera file."""
     count = 60
     folder = data_dir / "kitti_tracking" / "training" / "image_03" / "0005"
     own: Camera = KittiRecording(folder).camera

@@ -109,7 +109,7 @@ def measured(
     sigma_m: float = 1.0,
     sigma_log_height: Floats | float = 0.0,
 ) -> list[VehicleMeasurement]:
-    """A vehicle straight ahead of an ego that stands, at `xs_m` (N,)."""
+    """A vehicle straight ahead of a stationary ego, at `xs_m` (N,)."""
     each = np.broadcast_arrays(xs_m, log_heights, sigma_log_height, standing)
     out = []
     for k, (x_m, log_height, sigma, stands) in enumerate(zip(*(a.tolist() for a in each), strict=True)):
@@ -169,7 +169,7 @@ def test_stationary_vehicle_has_one_position() -> None:
     assert np.ptp(still) < 0.3
     assert abs(still.mean() - 40.0) < 0.3
     driving_m = 40.0 + 0.8 * np.arange(60)
-    told_wrong = along(measured(driving_m + noise, standing=0.95))  # its measurements say otherwise
+    told_wrong = along(measured(driving_m + noise, standing=0.95))  # its measurements contradict
     assert np.abs(told_wrong - driving_m).max() < 2.0
     assert np.abs(along(measured(driving_m + noise)) - told_wrong).max() == 0.0
 

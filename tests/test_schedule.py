@@ -51,7 +51,7 @@ lanes = { hz = 8 }
     assert schedule.lanes == Turn(every=4)
     spec = ModelSpec("n.onnx", every=5, threads=2)
     assert schedule.of("segmenter", spec) == ModelSpec("n.onnx", every=3, threads=2, awaited=False)
-    assert schedule.of("depth", spec) == spec  # of which nothing is said
+    assert schedule.of("depth", spec) == spec  # not configured
 
 
 @pytest.mark.parametrize(("rate_hz", "every"), [(33.0, 7), (10.0, 2), (5.0, 1), (2.0, 1)])
@@ -177,7 +177,7 @@ def test_late_head_is_skipped_with_status(monkeypatch: pytest.MonkeyPatch) -> No
         assert "segmenter" not in perception.ages
         assert perception.status == (Status.SEGMENTATION_CARRIED,)
         assert perception.ages["detector"] == 0
-    assert seen[first].ages["segmenter"] == first  # what was begun on frame 0, with its age
+    assert seen[first].ages["segmenter"] == first  # the run of frame 0, with its age
     assert seen[first].status == (Status.SEGMENTATION_CARRIED,)
     ran = heads["segmenter"].frames
     assert ran[0] == 0

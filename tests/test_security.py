@@ -66,7 +66,7 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @contextmanager
 def free_port() -> Iterator[int]:
-    """A port that nobody else is given meanwhile, and on which a gate may listen."""
+    """A reserved port for a gate."""
     with socket.socket() as holder:
         holder.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         holder.bind(("127.0.0.1", 0))
@@ -152,7 +152,7 @@ class Heard:
 
 @pytest.fixture
 def vehicle(tmp_path_factory: pytest.TempPathFactory, certificates: Path) -> Iterator[Vehicle]:
-    """The nodes on the bus, and the gate in a process of its own."""
+    """The nodes on the bus, and the gate in a separate process."""
     base = tmp_path_factory.mktemp("run")
     (base / "car.toml").write_text('vehicle = "car"\n')
     with ExitStack() as stack:
@@ -239,7 +239,7 @@ def answers(session: zenoh.Session, topic: str, limit_s: float = 2.0) -> int:
 @needs_openssl
 def test_planner_sends_only_permitted_queries(vehicle: Vehicle, certificates: Path) -> None:
     with outside(certificates, vehicle.port) as session, outside(certificates, vehicle.port, "stranger") as stranger:
-        hear(vehicle, session, keys(READABLE))  # each node has said something, which it keeps
+        hear(vehicle, session, keys(READABLE))  # each node has a retained message
         for topic in ASKABLE:
             until(lambda topic=topic: answers(session, topic) == 1, f"an answer about {topic}")  # type: ignore[misc]
         assert vehicle.nodes["optimize"].retained("measurements", LIMIT_S)  # inside, they are there to be had
@@ -400,7 +400,7 @@ def test_gate_accepts_only_tls(vehicle: Vehicle) -> None:
 
 @needs_openssl
 def test_a_peer_learns_no_way_around_the_gate(vehicle: Vehicle, certificates: Path) -> None:
-    """On this machine and as this user it could use the sockets, if it were told of them."""
+    """On this machine and as this user it could use the sockets if it knew them."""
     with outside(certificates, vehicle.port, mode="peer") as peer, outside(certificates, vehicle.port) as planner:
         heard = Heard()
         heard.listen(peer)

@@ -36,7 +36,7 @@ Image = np.ndarray
 Edit = Callable[[int, Image], Image]
 CAR_M = LocalisationConfig().vehicles["car"].height_m
 HEIGHT = CameraHeightConfig()
-PITCH_RAD, ROLL_RAD = 0.0165, 0.005  # of KITTI 06 as estimated from its frames: what its calibration would say
+PITCH_RAD, ROLL_RAD = 0.0165, 0.005  # of KITTI 06, estimated from its frames
 
 
 @functools.cache
@@ -198,7 +198,7 @@ def test_stop_keeps_the_scale(recorded: tuple[Camera, list[Image]]) -> None:
         return image if k < 20 else np.clip(images[20] + rng.normal(0.0, 1.5, image.shape), 0, 255).astype(np.uint8)
 
     assert carrying(Status.MOTION_IMPLAUSIBLE, drive(camera, images[:32], stop))  # no car stops within a frame
-    # What stands from one frame to the next may be on the glass: that the car stands is seen after a second
+    # Static features may be on the windscreen: a standstill is found after a second
     brakes = OdometryConfig(zero_velocity=ZeroVelocityConfig(braking_mps2=500.0))  # of this stop, and of no car
     any_stop = FrontEndConfig(odometry=brakes, plausibility=PlausibilityConfig(change_mps=50.0))
     estimates = drive(camera, images[:48], stop, config=any_stop)
@@ -286,7 +286,7 @@ def test_height_needs_a_known_tilt() -> None:
 
 @pytest.mark.slow  # a whole sequence
 def test_correct_camera_raises_no_alarm_on_real_boxes(data_dir: Path) -> None:
-    """KITTI tracking 0004: its camera looks down by half a degree, of which the file knows nothing."""
+    """KITTI tracking 0004: its camera looks down by half a degree, unlike its file."""
     root = data_dir / "kitti_tracking" / "training"
     sequence = open_tracking(root, "0004")
     detections = read_detections(root / "det_02_rrc", "0004", len(sequence))

@@ -63,7 +63,7 @@ def test_films_run_in_parallel_with_a_live_car(place: Path, films: int) -> None:
             for sentence in summary["verdict"]:  # on the terminal, in summary.json and in the text beside the results
                 assert sentence in out
                 assert sentence in (place / name / "README.txt").read_text()
-            assert "of its budget" not in out  # nobody waited for its frames
+            assert "of its budget" not in out  # its frames were not awaited
         lengths = [line for line in summary["verdict"] if line.startswith("Next: measure the height")]
         assert len(lengths) == 1
     left = [path.name for path in Path(os.environ["XDG_RUNTIME_DIR"], "birdslam").iterdir()]

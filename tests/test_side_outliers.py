@@ -90,7 +90,7 @@ def seen_at(x_m: float, y_m: float, hidden: float = 0.0) -> ParallaxMeasurements
 
 
 def drive_past(config: ParallaxConfig, hidden: float) -> tuple[float, Floats]:
-    """A parked car 6 m aside, half of whose box a tree hides for half a second: whether it stands, the outliers."""
+    """A parked car 6 m beside the ego, half hidden by a tree for 0.5 s: its motion state and the outliers."""
     parallax = Parallax(config)
     parallax.add_vehicle(np.array([40.0, 6.0]), 0.0, SE2(), math.log(CAR_HEIGHT_M), (0.08, 0.2))
     outlier = np.zeros(2)

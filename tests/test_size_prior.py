@@ -18,7 +18,7 @@ AT = np.array([1, 2])  # of log h of two vehicles, after what they share
 
 
 def born(dof: float = DOF) -> tuple[SizePrior, np.ndarray, np.ndarray]:
-    """Two vehicles as they begin: the prior, the state (common, log h, log h), and its covariance."""
+    """Two new vehicles: the prior, the state (common, log h, log h), and its covariance."""
     prior, x, P = SizePrior(COMMON, dof), np.zeros(3), np.zeros((3, 3))
     P[0, 0] = COMMON**2
     for k in AT:
@@ -42,7 +42,7 @@ def test_height_prior_has_class_spread_and_common_part() -> None:
     assert same_x == pytest.approx(x)
     assert same_P == pytest.approx(P)
     x, _ = measured(x, P, math.log(1.6), 0.01)
-    assert math.log(1.5) < x[2] < x[1]  # a taller car tells of taller cars
+    assert math.log(1.5) < x[2] < x[1]  # a taller car raises the common part
 
 
 @pytest.mark.parametrize(("height_m", "nearer"), [(1.85, True), (1.5, False)])

@@ -38,7 +38,7 @@ def image(value: int = 0) -> np.ndarray:
 
 
 class Live:
-    """A camera that delivers when it is told to."""
+    """A camera that delivers on request."""
 
     name, camera, rate_hz, live = "camera", CAMERA, 10.0, True
 

@@ -198,7 +198,7 @@ def test_invalid_table_is_named(text: str, said: str, tmp_path: Path) -> None:
 
 
 def test_a_track_gives_the_speed(tmp_path: Path) -> None:
-    """1.1 m a second to the north, by GPX without speeds; the film's clock begins at 0."""
+    """1.1 m a second to the north, by GPX without speeds; the film's clock starts at 0."""
     path, step_deg = tmp_path / "track.gpx", math.degrees(1.1 / 6_371_000.0)
     points = "".join(
         f'<trkpt lat="{50.0 + k * step_deg:.9f}" lon="7.0"><time>2024-05-01T10:00:{k:02d}Z</time></trkpt>'

@@ -53,7 +53,7 @@ def reading(t_ns: int, speed_mps: float = 5.0) -> SpeedReading:
 
 
 class Inbox:
-    """A subscriber that a test fills; as deep as the topology says."""
+    """A subscriber filled by the test, with the topology's depth."""
 
     malformed = 0
 
@@ -74,7 +74,7 @@ class Inbox:
 def test_a_frame_carries_the_last_second_in_order_of_arrival() -> None:
     inbox = Inbox()
     speeds = CarSpeeds(inbox)
-    said = [reading(1), reading(2_000 * MS), reading(3, math.nan), reading(3)]  # whatever times the car may say
+    said = [reading(1), reading(2_000 * MS), reading(3, math.nan), reading(3)]  # any times of the car
     for number, one in enumerate(said):
         inbox.come(one, number * 500 * MS)
     for t_ns, wanted in ((1_400 * MS, said[1:]), (1_700 * MS, said[2:]), (2_499 * MS, said[3:]), (9_000 * MS, [])):
@@ -83,7 +83,7 @@ def test_a_frame_carries_the_last_second_in_order_of_arrival() -> None:
 
 
 def test_a_reading_without_a_time_gets_its_time_of_arrival() -> None:
-    """By the source's clock: for a camera that is CLOCK_MONOTONIC, a recording that is paced has one of its own."""
+    """In the source's clock: CLOCK_MONOTONIC for a camera, a separate clock for a paced recording."""
     said = (reading(0), reading(6_990 * MS), reading(-(1 << 63)), reading((1 << 64) - 1))
     inbox = Inbox()
     for one in said:
@@ -182,7 +182,7 @@ def test_frames_carry_readings_at_50_hz_despite_malformed_messages(
         until(lambda: matched(plain), "capture, which subscribes")
 
         def until_taken(count: int) -> FrameRef:
-            """The frame that bears what has been said."""
+            """The frame that carries the readings."""
             until_s = time.monotonic() + LIMIT_S
             while time.monotonic() < until_s:
                 ref = node.frame()
@@ -200,7 +200,7 @@ def test_frames_carry_readings_at_50_hz_despite_malformed_messages(
 
         for wrong in (b"", b"\xc1", msgpack.packb({"t_ns": 1}), msgpack.packb([1, 2.0]), bytes(5_000)):
             plain.put(wrong)
-        plain.put(msgpack.packb({"t_ns": 0, "speed_mps": math.nan, "sigma_mps": 0.1}))  # is what a sensor says
+        plain.put(msgpack.packb({"t_ns": 0, "speed_mps": math.nan, "sigma_mps": 0.1}))  # are a sensor's readings
         last = until_taken(11).speeds[-1]
         assert math.isnan(last.speed_mps)
         assert t_ns < last.t_ns <= time.monotonic_ns()
@@ -254,7 +254,7 @@ def test_a_repeatable_run_ignores_the_bus(
 
 
 class RecorderBus(FakeBus):
-    """And lets the recorder say how it is."""
+    """Also lets the recorder report its health."""
 
     def publisher(self, topic: str) -> RecorderBus:
         return self
@@ -266,7 +266,7 @@ class RecorderBus(FakeBus):
 
 @given(st.lists(st.integers(0, 3), max_size=12), st.data())
 def test_frame_adds_readings_since_the_previous_one(said: list[int], data: st.DataObject) -> None:
-    """Of a car that says something else each time; one that repeats itself may be taken to have said it once."""
+    """From a car with varying readings; equal ones may be merged."""
     readings = [reading(number, math.nan if kind == 0 else float(kind)) for number, kind in enumerate(said)]
     begin = data.draw(st.integers(0, len(said)))
     end = data.draw(st.integers(begin, len(said)))

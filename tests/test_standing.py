@@ -71,7 +71,7 @@ def test_new_vehicle_is_undecided_with_velocity_pulled_to_zero() -> None:
     assert 0.2 < new.standing < 0.8
     u, C = reported(new, (6.0, 0.0), 36.0 * np.eye(2))
     assert u[0] < 6.0 * (1.0 - new.standing) + 1e-9
-    assert u[0] - 2.0 * math.sqrt(C[0, 0]) < 0.0  # nor is it told to drive for sure
+    assert u[0] - 2.0 * math.sqrt(C[0, 0]) < 0.0  # nor reported as certainly moving
 
 
 def test_both_filters_must_agree() -> None:
@@ -122,7 +122,7 @@ def test_unobserved_vehicles_are_not_decided(vehicle: VehicleNode) -> None:
 def driven_past(
     speed_mps: float, standing: float, config: GraphConfig, weights: WeightsConfig
 ) -> list[VehicleEstimate]:
-    """A vehicle 3 m to the side, placed with errors that last, as told by the graph in each of 40 frames at 10 Hz."""
+    """Estimates of a vehicle 3 m to the side with correlated errors, in 40 frames at 10 Hz."""
     graph, told = PoseGraph(config, weights), []
     for k in range(40):
         step = EgoEdge(from_frame=k - 1, to_frame=k, T_from_to=SE2(1.0), cov=tuple((1e-4 * np.eye(3)).ravel()))

@@ -94,7 +94,7 @@ def test_repeated_image_adds_no_information() -> None:
     passing = GroundSizeFilter(CAMERA, CONFIG)
     for _ in range(600):
         see(passing, boxes, 0.0, speed_mps=10.0)
-    assert passing.sigma_pitch_rad < 0.85 * once_rad  # who drives by shows a new view of itself in each frame
+    assert passing.sigma_pitch_rad < 0.85 * once_rad  # a passing vehicle shows a new aspect in each frame
 
 
 def test_information_while_stationary_is_limited_by_the_number_of_cars() -> None:

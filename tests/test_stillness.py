@@ -39,7 +39,7 @@ def road_image(along_m: float, contrast_grey: float) -> np.ndarray:
 
 
 def behind_drops(image: np.ndarray, seed: int = 2, count: int = 500) -> np.ndarray:
-    """Small drops that stand still over most of the image."""
+    """Small fixed drops over most of the image."""
     rng, out = np.random.default_rng(seed), image.astype(np.float32)
     for _ in range(count):
         centre = (int(rng.integers(0, WIDTH_PX)), int(rng.integers(0, HEIGHT_PX)))

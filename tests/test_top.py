@@ -26,7 +26,7 @@ LIMIT_S = 60.0
 
 @pytest.fixture
 def vehicle(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A bus with three nodes on it that have said how they are, and a supervisor that answers queries."""
+    """A bus with three nodes that have published their health, and a supervisor that answers queries."""
     place = tmp_path_factory.mktemp("t")
     with ExitStack() as stack:
         hub = stack.enter_context(Bus("car", "supervisor", hub=True, runtime_dir=place))

@@ -67,11 +67,11 @@ def test_parked_cars_keep_their_ids_and_places_as_the_ego_passes() -> None:
     for poses in place_of.values():
         nearest = min(parked, key=lambda p: math.hypot(p.x_m - poses[-1].x_m, p.y_m - poses[-1].y_m))
         assert math.hypot(nearest.x_m - poses[-1].x_m, nearest.y_m - poses[-1].y_m) < 0.5
-        assert abs(wrap(poses[-1].yaw_rad)) < 0.2  # it stands, so it keeps the road's direction
+        assert abs(wrap(poses[-1].yaw_rad)) < 0.2  # stationary, so it keeps the road's direction
 
 
 def test_prediction_depends_on_the_motion_state() -> None:
-    """(places' 1-sigma, speed) of a parked car and of one that drives, without and with what standing says."""
+    """(1-sigma of position, speed) of a parked and a moving car, without and with the motion state."""
     found = {}
     for sigma_mps in (1e3, TrackingConfig().sigma_standing_mps):
         drive = Drive(TrackingConfig(sigma_standing_mps=sigma_mps), noise_px=0.5)
@@ -236,7 +236,7 @@ def test_unusual_size_keeps_its_id_while_size_is_estimated() -> None:
 
 
 class Looks:
-    """A standing ego that looks at one standing car, and is told by a network how that faces."""
+    """A stationary ego observes a stationary car, with a network that gives its heading."""
 
     def __init__(self, config: TrackingConfig | None = None) -> None:
         self.drive = Drive(config)
@@ -317,7 +317,7 @@ def test_car_is_not_associated_with_objects_behind_it(label: str) -> None:
 
 
 def test_each_filter_has_exactly_one_row_per_track() -> None:
-    """Cars come and go in any order: whether one stands stays with it."""
+    """Cars come and go in any order; each keeps its motion state."""
     drive = Drive(noise_px=0.3)
     tall = SE2(70.0, -8.0)
     for k in range(60):

@@ -23,7 +23,7 @@ def label(track: int, box: tuple[float, float, float, float], kind: str = "Car",
 
 
 def exact(labels: list[int], tracks: list[int]) -> BoxFrame:
-    """A frame in which the k-th track lies exactly on the k-th label."""
+    """A frame in which the k-th track matches the k-th label exactly."""
     return BoxFrame(np.array(labels), np.array(tracks), np.eye(len(labels), len(tracks)))
 
 

@@ -100,7 +100,7 @@ def test_a_covariance_of_the_wrong_size_is_refused_on_decoding() -> None:
 
 
 def test_a_station_of_an_older_record_keeps_its_meaning() -> None:
-    """Before `kind` its id said what a landmark is, from 2**48 on."""
+    """Before `kind` existed, ids from 2**48 on were stations."""
     cov = [1.0, 0.0, 0.0, 1.0]
     station, point = (msgspec.convert([landmark, 5, 2.0, 1.0, cov], LandmarkEdge) for landmark in ((1 << 48) + 41, 41))
     assert (station.kind, station.landmark) == (LandmarkKind.LANE_STATION, 41)

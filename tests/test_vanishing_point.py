@@ -69,7 +69,7 @@ def test_other_directions_have_little_effect() -> None:
 
 @pytest.mark.parametrize("curvature_per_m", [0.0008, -0.0008])
 def test_lines_meet_higher_in_a_sag(curvature_per_m: float) -> None:
-    """Where they lead lies in the road at the distance that is told."""
+    """Their target is on the road at the stated distance."""
     lines = fit_vanishing_point(CAMERA, CONFIG, segments(0.01, 0.0, curvature_per_m), 0.01, 0.0, 0.0)
     assert lines is not None
     there = plane_normal(0.01 + curvature_per_m * lines.distance_m, 0.0)[0]
@@ -100,7 +100,7 @@ def painted(pitch_rad: float) -> NDArray[np.uint8]:
 def test_images_are_used_every_few_metres_of_straight_road() -> None:
     detector, image = VanishingPointDetector(CAMERA, CONFIG), painted(0.02)
     first = detector.detect(image, NO_BOXES, 0.0, 0.0, 0.0, 0.5)
-    assert first is not None  # what a file says of the pitch may be wrong
+    assert first is not None  # the file's pitch may be wrong
     assert abs(float(plane_normal(0.02, 0.0)[0] @ first.direction)) < 2.0 * first.sigma_rad
     assert detector.detect(image, NO_BOXES, 0.0, 0.0, 0.0, 0.9 * CONFIG.every_m) is None
     assert detector.detect(image, NO_BOXES, 0.0, 0.0, 2.0 * CONFIG.max_bend_per_m, CONFIG.every_m) is None

@@ -99,7 +99,7 @@ def test_everything_of_a_drive_is_sent(tape: Tape) -> None:
         "bev/lines",
     ):
         assert logged[entity] == 30, entity
-    assert logged["world"] == 3  # its axes, and two epochs that begin
+    assert logged["world"] == 3  # its axes, and the start of two epochs
     assert any(entity.startswith("world/map/") for entity in logged)
     assert logged["ego/sigma_yaw_rad"] == 30
     assert logged["status"] >= 2

@@ -38,9 +38,9 @@ def test_workers_end_with_a_process_that_is_killed(how: signal.Signals, tmp_path
         begun = {process.stdout.readline() for _ in range(2)}
         assert begun == {"task 0 begun\n", "task 1 begun\n"}
         process.send_signal(how)
-        out, _ = process.communicate(timeout=LIMIT_S)  # returns once nobody holds the workers' standard output any more
+        out, _ = process.communicate(timeout=LIMIT_S)  # returns when all workers have closed their standard output
         assert process.returncode == -how
-        assert out == ""  # the tasks that waited were not begun
+        assert out == ""  # waiting tasks were not started
     finally:
         process.kill()
 

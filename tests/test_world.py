@@ -96,7 +96,7 @@ def test_the_box_in_space_projects_onto_the_box_in_the_image(level: list[WorldFr
                 continue
             outer = np.concatenate([px.min(axis=0), px.max(axis=0)])
             size = max(float((outer[2:] - outer[:2]).max()), 1.0)
-            # The body fills its box but for rounded ends; mirrors stand out of it
+            # The body fills its box except for rounded ends; mirrors protrude
             np.testing.assert_allclose(body.full_box_px, outer, atol=0.12 * size + 1.0)
             checked += 1
     assert checked > 20

@@ -56,7 +56,7 @@ def test_passing_a_parked_car_determines_its_yaw(yaw_deg: float, scale: float) -
 
 @pytest.mark.parametrize("yaw_deg", [-60.0, -50.0, -40.0])
 def test_ambiguous_yaw_is_uncertain(yaw_deg: float) -> None:
-    """Across the line of sight all outlines are as wide: driving by does not tell such a yaw from its mirror image."""
+    """Across the line of sight all outlines have equal width, so passing leaves the mirror ambiguity."""
     outline, yaw_rad, told, sigma_rad = YawByOutline(CONFIG), math.radians(yaw_deg), 0.0, 0.0
     outline.add_vehicle()
     for k in range(30):
@@ -78,7 +78,7 @@ def test_repeated_observation_adds_no_information() -> None:
 
 
 def test_car_ahead_of_a_turning_ego_follows_the_road() -> None:
-    """It is first seen out of a turn, and taken to stand as the ego is headed only once the way is straight."""
+    """First observed in a turn; it is assumed parallel to the ego only on straight road."""
     outline, told = YawByOutline(CONFIG), 0.0
     outline.add_vehicle()
     pose = SE2(0.0, 0.0, math.radians(-40.0))
