@@ -15,7 +15,7 @@ class Word(enum.StrEnum):
 
 
 class Status(Word):
-    """Expected trouble, carried in the record; `INVALIDATING` says which make an estimate invalid."""
+    """Expected problems, reported in records; those in `INVALIDATING` make an estimate invalid."""
 
     END_OF_SOURCE = "end_of_source"  # the source has no further frame; the last record of a run
     FRAME_UNREADABLE = "frame_unreadable"  # the image is damaged or missing: this frame has no pixels

@@ -573,16 +573,16 @@ class RoadUser(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     T_world_vehicle: SE2  # where it is
     cov: Cov3  # of the pose
     velocity_mps: Annotated[tuple[float, ...], msgspec.Meta(min_length=2, max_length=2)]  # (x, y) in world
-    velocity_cov: Cov2  # of the velocity, including the probability that it stands
+    velocity_cov: Cov2  # of the velocity, including the probability that it is stationary
     age_ns: int  # source time since the last frame with a measurement of it; 0: this frame
     frames: int  # the number of frames it has been seen in
     label: str = "car"  # its class
     length_m: float = 4.0  # of its footprint
     width_m: float = 1.7  # of its footprint
     delay_ns: int = 0  # delay of the image that it was seen in: it was last seen age_ns + delay_ns ago
-    moves: Moves = Moves.UNDECIDED  # whether it stands or drives, with hysteresis
-    standing: Probability = 0.5  # the last probability that it stands
-    label_probability: Probability | None = None  # of its class; None: nobody said
+    moves: Moves = Moves.UNDECIDED  # whether it is stationary or moving, with hysteresis
+    standing: Probability = 0.5  # the last probability that it is stationary
+    label_probability: Probability | None = None  # of its class; None: unknown
     height_m: float | None = None  # None: not known
     sigma_height_m: float = 0.0
     child: Probability = 0.0  # the probability of a child's height

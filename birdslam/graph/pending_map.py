@@ -1,4 +1,4 @@
-"""What the map gained and nobody has asked for yet, in world: settled landmarks and points of lanes."""
+"""New map points in world that `map_update` has not returned yet: settled landmarks and points of lanes."""
 
 from __future__ import annotations
 

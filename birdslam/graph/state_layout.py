@@ -43,7 +43,7 @@ class StateLayout:
     @staticmethod
     @functools.lru_cache(maxsize=64)
     def of(nodes: int, vehicles: int) -> StateLayout:
-        """The layout, which nobody may change: vehicles come and go, a few in each number."""
+        """The cached layout for this number of vehicles; must not be modified."""
         return StateLayout(nodes, vehicles)
 
     @staticmethod

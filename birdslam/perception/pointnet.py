@@ -1,8 +1,8 @@
 """Frustum-PointNet: locates the body in each box from the pseudo-lidar points inside the box.
 
 A manifest states the network's input and outputs, as for networks on images. The points of a box are rotated about the
-camera's down axis until the box's middle lies straight ahead, as in the Frustum-PointNet paper. Where the manifest says
-`centred` they are relative to the point of that ray at the depth of the box's middle.
+camera's down axis until the box's middle is straight ahead, as in the Frustum-PointNet paper. With `centred` in the
+manifest they are relative to the point of that ray at the depth of the box's middle.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The closest approach of road users to the ego, if all keep their present velocity.
 
-An aid for planners, not a safety function: it knows no intentions and no undetected road users. With p and v the
+An aid for planners, not a safety function: it ignores intentions and undetected road users. With p and v the
 position and velocity relative to the ego, t = -p.v / v.v and d = |p + v t|; their sigmas follow from the covariances of
 p and v to first order.
 """

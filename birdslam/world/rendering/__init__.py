@@ -1,5 +1,5 @@
-"""The renderer of the built-in world: bodies on a street to light, depth, classes and instances of each pixel.
+"""The renderer of the built-in world: light, depth, classes and instances of each pixel.
 
-Read `scene` (what goes in and comes out), then `renderer`. Kernels are compiled by numba (`compiled` says how): after
-an edit delete the `__pycache__/*.nb*` beside them.
+Read `scene` (input and output), then `renderer`. numba compiles the kernels (see `compiled`); after an edit delete the
+`__pycache__/*.nb*` beside them.
 """

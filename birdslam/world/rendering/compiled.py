@@ -1,7 +1,7 @@
-"""How the functions that run for each pixel are compiled by numba.
+"""Compiler settings of numba for functions that run per pixel.
 
-They take arrays by the dozen and allocate none. So no references are counted in them (`_nrt=False`): at that size numba
-no longer sees which counts cancel out, and counting took four fifths of the time of a frame's shading.
+They have many array arguments and allocate nothing, so reference counting is off (`_nrt=False`): it would dominate the
+time of shading.
 """
 
 from __future__ import annotations

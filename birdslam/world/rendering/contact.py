@@ -1,4 +1,4 @@
-"""How dark the road is under and beside vehicles: a map of the area ahead. Compiled by numba."""
+"""Contact shadows under and beside vehicles, as a map of the area ahead. Compiled by numba."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from birdslam.world.rendering.compiled import inlined
 
 @inlined
 def contact_light(contact, x, y):  # type: ignore[no-untyped-def]
-    """Share of the sky that the ground at (x, y) sees past the vehicles over it, from a map of the area ahead.
+    """Fraction of the sky visible from the ground at (x, y), from a map of the area ahead.
 
     `contact` = (map, (x of its first row, y of its first column, cells a metre)).
     """
@@ -30,8 +30,7 @@ def contact_light(contact, x, y):  # type: ignore[no-untyped-def]
 def contact_map(shade_map, x0, y0, cells_per_m, poses, sizes, at_edge, reach_m):  # type: ignore[no-untyped-def]
     """Darken `shade_map` under each body: `poses` (n, 3) x y yaw, `sizes` (n, 2) length and width.
 
-    `at_edge` is the share of the light that is left where a body's side stands over the ground; `reach_m` from there
-    all of it is.
+    `at_edge` is the fraction of light at a body's side; it rises to 1 over `reach_m`.
     """
     shade_map[:] = 1.0
     for k in range(poses.shape[0]):

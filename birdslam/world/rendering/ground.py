@@ -18,7 +18,7 @@ _CROSSING_RAMP_M = 1.6
 
 @njit(cache=True, nogil=True)
 def _flat(crossings, s, side):  # type: ignore[no-untyped-def]
-    """0 on a crossing's level, 1 where kerbs stand full."""
+    """0 within a crossing, 1 at full kerb height."""
     out = 1.0
     for k in range(crossings.shape[0]):
         if crossings[k, 2 if side > 0 else 3] > 0.5:
@@ -34,7 +34,7 @@ def strips(B, body, stations, bands, crossings, base):  # type: ignore[no-untype
 
     Corners are in world; attributes (s, d, height over the road).
     """
-    k = begin(B, body, m.GROUND, 2)  # fields as far as one sees
+    k = begin(B, body, m.GROUND, 2)  # fields up to the horizon
     far, low = 1500.0, -0.35
     for c in range(6 if k >= 0 else 0):
         x, y = (-far if c in (0, 3, 5) else far), (-far if c in (0, 1, 3) else far)
@@ -90,14 +90,14 @@ def crossing_at(crossings, s, d, right, left):  # type: ignore[no-untyped-def]
 
 @inlined
 def _coverage(off, half, footprint):  # type: ignore[no-untyped-def]
-    """Share of a pixel `footprint` wide that a stripe of half width `half`, `off` away, covers."""
+    """Fraction of a pixel of width `footprint` covered by a stripe of half width `half` at distance `off`."""
     lo, hi = max(off - 0.5 * footprint, -half), min(off + 0.5 * footprint, half)
     return max(0.0, hi - lo) / max(footprint, 1e-4)
 
 
 @inlined
 def _line_at(lines, s, d, footprint_d, footprint_s):  # type: ignore[no-untyped-def]
-    """How much of the pixel lane lines cover, and which line that is; -1 for none."""
+    """Fraction of the pixel covered by lane lines, and the line's index, -1 for none."""
     best, which = 0.0, -1
     for k in range(lines.shape[0]):
         kind, width = int(lines[k, 1]), lines[k, 2]
@@ -231,7 +231,7 @@ def _surface(kind, tone, bank, s, d, foot, sky):  # type: ignore[no-untyped-def]
 
 @inlined
 def shade_ground(ground, bank, pictures, sky, s, d, footprint_d, footprint_s):  # type: ignore[no-untyped-def]
-    """(r, g, b, mirror, class) of the ground at (s, d) for a pixel that spans so many metres across and along.
+    """(r, g, b, mirror, class) of the ground at (s, d) for a pixel with this footprint in metres across and along.
 
     `ground` = the street's (bands, lines, crossings, marks), `marks_by_metre`, and (right edge, left edge, surface and
     tone of side roads).

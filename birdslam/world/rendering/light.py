@@ -1,10 +1,10 @@
-"""What light falls on a surface and what its gloss shows: sun, sky, shadows, noise; in ego axes. Compiled by numba.
+"""Illumination and reflections of surfaces: sun, sky, shadows, noise; in ego axes. Compiled by numba.
 
 `sky` holds: 0-2 towards the sun, 3-5 its light, 6-8 light from the zenith, 9-11 light from the horizon, 12-14 haze,
 15 metres of sight, 16 wetness of the road, 17 clouds, 18 seed, 19 glare about the sun, 20 leaves' translucence,
 21 light from a street canyon (ambient factor), 22 snow or dust on grass (brightness), 23 season's tint of grass,
-24 how coarse the grit of asphalt is, 25 how rough the grass is, 0 a mown lawn, 26-34 the rotation from ego to world,
-in which clouds and skyline stay where they are while the ego turns.
+24 coarseness of the asphalt's grit, 25 roughness of the grass (0: a lawn), 26-34 the rotation from ego to world, in
+which clouds and skyline are fixed.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ SKY_SLOTS = 35
 
 @per_pixel
 def hashed(a, b):  # type: ignore[no-untyped-def]
-    """A number in [0, 1) of two others, without pattern."""
+    """A pseudo-random number in [0, 1) from two numbers."""
     v = math.sin(a * 127.1 + b * 311.7) * 43758.5453
     return v - math.floor(v)
 
 
 @per_pixel
 def noise(bank, channel, u, v, texels):  # type: ignore[no-untyped-def]
-    """The channel at (u, v) in tiles, of the level whose texels are as large as the pixel (`texels` of level 0)."""
+    """The channel at (u, v) in tiles, at the level that matches the pixel's size of `texels` at level 0."""
     level = 0
     while texels > 1.4 and level < 6:
         texels *= 0.5
         level += 1
     size = bank.shape[2] >> level
-    half = 0.5 - 0.5 / (1 << level)  # a coarse texel's middle lies between fine ones: nothing moves with the level
+    half = 0.5 - 0.5 / (1 << level)  # aligns the centres of coarse and fine texels
     x, y = u * size - half, v * size - half
     xf, yf = math.floor(x), math.floor(y)
     fx, fy = x - xf, y - yf
@@ -77,7 +77,7 @@ def sky_colour(sky, bank, x, y, z):  # type: ignore[no-untyped-def]
 
 @per_pixel
 def mirrored(sky, bank, x, y, z):  # type: ignore[no-untyped-def]
-    """What a glossy surface shows in the direction (x, y, z): sky, a skyline of houses and trees, the road."""
+    """The reflection in the direction (x, y, z): sky, a skyline of houses and trees, the road."""
     east, north, _ = _in_world(sky, x, y, z)
     bearing = math.atan2(north, east)
     line = 0.12 + 0.05 * noise(bank, 0, bearing * 0.12 + sky[18], 0.37, 4.0)
@@ -93,7 +93,7 @@ def mirrored(sky, bank, x, y, z):  # type: ignore[no-untyped-def]
 
 @inlined
 def _lookup(highest, lean, origin, cells_per_m, x, y, z, bias):  # type: ignore[no-untyped-def]
-    """Share of the sun that reaches (x, y, z): four neighbouring rays blended; -1 outside of the map."""
+    """Fraction of sunlight at (x, y, z), from four neighbouring rays; -1 outside of the map."""
     u = (x - z * lean[0] - origin[0]) * cells_per_m
     v = (y - z * lean[1] - origin[1]) * cells_per_m
     i, j = math.floor(u), math.floor(v)
@@ -111,7 +111,7 @@ def _lookup(highest, lean, origin, cells_per_m, x, y, z, bias):  # type: ignore[
 
 @inlined
 def sunlit(maps, x, y, z, nx, ny, nz, bias):  # type: ignore[no-untyped-def]
-    """Share of the sun that reaches a point of a surface with this normal, from the fine map or the coarse one.
+    """Fraction of sunlight at a point with this normal, from the fine or the coarse map.
 
     `maps` = (fine, coarse, lean, origin of the fine, origin of the coarse, cells a metre of both); `lean` is the sun's
     direction per metre of height.
@@ -127,7 +127,7 @@ def sunlit(maps, x, y, z, nx, ny, nz, bias):  # type: ignore[no-untyped-def]
 
 @inlined
 def sunlight(sky, maps, x, y, z, nx, ny, nz, bias, soft):  # type: ignore[no-untyped-def]
-    """How much of the sun's light a surface with this normal gets; with `soft`, part of it from behind too."""
+    """Sunlight on a surface with this normal; `soft` surfaces also get light from behind."""
     toward = nx * sky[0] + ny * sky[1] + nz * sky[2]
     direct = 0.0
     if sky[4] > 0.0 and (toward > 0.0 or soft > 0.0):
@@ -137,7 +137,7 @@ def sunlight(sky, maps, x, y, z, nx, ny, nz, bias, soft):  # type: ignore[no-unt
 
 @inlined
 def skylight(sky, maps, contact, mat, x, y, z, w, nx, ny, nz):  # type: ignore[no-untyped-def]
-    """(red, green, blue) that a surface gets from the sky, the horizon, and the road that the sun lights.
+    """(red, green, blue) of the light from the sky, the horizon, and the sunlit road.
 
     `w` is the height over the road of a vehicle's paint.
     """
@@ -147,7 +147,7 @@ def skylight(sky, maps, contact, mat, x, y, z, w, nx, ny, nz):  # type: ignore[n
     if mat != m.GROUND and high < 0.8 and nz < 0.5:
         open_sky *= 0.6 + 0.4 * max(high, 0.0) / 0.8
     bounce, lit_road = 0.18 * (1.0 - up), max(sky[2], 0.0)
-    if mat == m.PAINT and sky[4] > 0.0 and nz < 0.5:  # the road that a panel faces may lie in the body's own shadow
+    if mat == m.PAINT and sky[4] > 0.0 and nz < 0.5:  # the road at a panel may be in the body's own shadow
         share = 0.0
         for j in range(3):
             away = 0.5 + 0.7 * j
@@ -162,10 +162,9 @@ def skylight(sky, maps, contact, mat, x, y, z, w, nx, ny, nz):  # type: ignore[n
 
 @inlined
 def glossed(sky, bank, wet, mirror, direct, facing, ex, ey, ez, nx, ny, nz, red, green, blue):  # type: ignore[no-untyped-def]
-    """The light of a surface that mirrors so much straight on: sky and skyline in it, and the sun's glint.
+    """Adds reflections of sky and skyline, and the sun's glint; `mirror` is the reflectance at normal incidence.
 
-    (ex, ey, ez) is the line of sight, `facing` its cosine to the normal. A `wet` road mirrors most at a flat
-    angle.
+    (ex, ey, ez) is the line of sight, `facing` its cosine to the normal. A `wet` road reflects most at grazing angles.
     """
     f = max(0.0, 1.0 - facing)
     fresnel = mirror + (1.0 - mirror) * 0.9 * f * f * f * f * f
@@ -183,6 +182,6 @@ def glossed(sky, bank, wet, mirror, direct, facing, ex, ey, ez, nx, ny, nz, red,
 
 @inlined
 def hazed(sky, far_m, red, green, blue):  # type: ignore[no-untyped-def]
-    """Light from so far away, through the air."""
+    """Light from this distance through haze."""
     haze = 1.0 - math.exp(-far_m / sky[15]) if far_m > 0.01 * sky[15] else 0.0
     return red + (sky[12] - red) * haze, green + (sky[13] - green) * haze, blue + (sky[14] - blue) * haze

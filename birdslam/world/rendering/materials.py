@@ -1,4 +1,4 @@
-"""Names of materials, body kinds and the slots of a body's parameters: what meshes and shading have in common."""
+"""Constants shared by meshes and shading: materials, body kinds, and slots of a body's parameters."""
 
 (
     GROUND,
@@ -33,15 +33,15 @@
     Z_NOSE,
     Z_COWL,
     Z_TAIL,
-    TUMBLE,  # how far the windows lean in at the roof, in metres
+    TUMBLE,  # inclination of the windows, in metres at the roof
     ROUND_FRONT,
     ROUND_REAR,
     WHEEL_RADIUS,
     X_FRONT_AXLE,
     X_REAR_AXLE,
     X_PILLAR,
-    GLASS,  # how much light the windows let through
-    X_GLASS_END,  # side windows reach back to here
+    GLASS,  # transmittance of the windows
+    X_GLASS_END,  # rear end of the side windows
     BRAKING,
     PLATE,  # 0 white, 1 yellow, 2 none
     HEADLIGHTS,
@@ -62,5 +62,5 @@
     LOFT_X1,
     PHASE,  # of a stride, in radians
 ) = range(8, 45)
-# Everything else uses slots 8 and up as its mesh says
+# All other kinds use slots from 8 as their meshes define
 SLOTS = 48

@@ -1,8 +1,8 @@
-"""A night without street lamps: two low beams light the road, others' lamps are bright spots; numpy and OpenCV.
+"""A night without street lamps: two low beams light the road, other lamps are bright spots; numpy and OpenCV.
 
-The scene is rendered in even light first (`even_sky`): that is how bright each pixel's surface is, and with its depth
-it is lit here again. Luminance is in cd/m^2. Paint with glass beads sends the beam back to the car: 0.15 cd/(m^2 lx),
-bare asphalt a tenth of that (EN 1436, Table 3); most of what a driver sees of a dry road at night is that.
+The scene is first rendered in even light (`even_sky`), which gives the albedo of each pixel, then lit again with its
+depth. Luminance is in cd/m^2. Retroreflection is 0.15 cd/(m^2 lx) for paint with glass beads and a tenth of that for
+asphalt (EN 1436, Table 3).
 """
 
 from __future__ import annotations
@@ -27,23 +27,23 @@ POSTS = CLASSES.index("pole_sign")
 ASPHALT_RETRO, PAINT_RETRO, FOIL_RETRO = 0.015, 0.15, 3.0  # cd/(m^2 lx)
 ASPHALT_ALBEDO = 0.1
 TAIL_CD, FACING_CD = 6.0, 250.0  # a tail lamp, and the glare of an oncoming low beam above its cut-off
-BLUR_STEPS = 5  # views within an exposure
+BLUR_STEPS = 5  # samples of the motion blur
 _EVEN = 1.0  # light of the even sky
 
 
 @dataclass(frozen=True)
 class Night:
-    """The car's own lamps, and how long the camera's shutter is open."""
+    """The ego's lamps, and the camera's exposure time."""
 
-    ambient_lx: float = 0.02  # the moon, and a far town
-    beam_cd: float = 12_000.0  # of one lamp, where it is brightest
+    ambient_lx: float = 0.02  # moon and distant town
+    beam_cd: float = 12_000.0  # maximum of one lamp
     lamps_m: tuple[tuple[float, float, float], ...] = ((1.6, 0.6, 0.65), (1.6, -0.6, 0.65))  # in ego
-    dip: float = 0.012  # metres that the cut-off falls in one metre
+    dip: float = 0.012  # slope of the cut-off, downwards
     exposure_s: float = 0.02
 
 
 def even_sky(grit: float = 0.0) -> Floats:
-    """Light from everywhere, without sun and haze: what is rendered under it is how surfaces reflect.
+    """Uniform light without sun and haze, which renders the albedo.
 
     `grit` is the contrast of the asphalt's stones.
     """
@@ -58,7 +58,7 @@ def lit(
     night: Night, rendered: Rendered, scene: Bodies, camera: Camera, T_world_ego: Floats, speed_mps: float,
     yaw_rate_radps: float,
 ) -> Floats32:  # fmt: skip
-    """(H, W, 3) linear BGR luminance of a scene that was rendered under `even_sky`, blurred by the ego's motion."""
+    """Linear BGR luminance (H, W, 3) of a scene that was rendered under `even_sky`, with motion blur."""
     height, width = rendered.depth_m.shape
     v, u = np.mgrid[0:height, 0:width].astype(np.float64)
     rays = np.stack(
@@ -76,7 +76,7 @@ def lit(
     out = albedo * np.float32(night.ambient_lx / math.pi)
     for lamp_m in night.lamps_m:
         lux, sine = _beam(night, points - np.array(lamp_m))
-        slant = np.where(level, sine, 0.6)  # what stands is met from the front, more or less
+        slant = np.where(level, sine, 0.6)  # vertical surfaces face the lamp approximately
         out += (lux * slant / math.pi).astype(np.float32)[..., None] * albedo
         out += lux.astype(np.float32)[..., None] * back
     out += np.float32(0.3 * night.ambient_lx / math.pi) * sky[..., None]
@@ -85,7 +85,7 @@ def lit(
 
 
 def _retroreflection(albedo: Floats32, classes: NDArray[np.uint8]) -> Floats32:
-    """(H, W, 3) cd/(m^2 lx) that goes back to where the light comes from."""
+    """Retroreflection (H, W, 3) in cd/(m^2 lx)."""
     bright = albedo.mean(axis=2)
     paint = np.clip((bright - 0.2) / 0.3, 0.0, 1.0) * np.isin(classes, PAINTED_CLASSES)
     foil = np.clip((bright - 0.35) / 0.2, 0.0, 1.0) * (classes == POSTS)
@@ -95,9 +95,9 @@ def _retroreflection(albedo: Floats32, classes: NDArray[np.uint8]) -> Floats32:
 
 
 def _beam(night: Night, away: Floats) -> tuple[Floats, Floats]:
-    """Of one lamp at points (..., 3) from it in ego: lux on a surface across the beam; sine of its fall to the road.
+    """The beam of one lamp at points (..., 3) from it in ego: lux across the beam, and sine of the angle to the road.
 
-    Brightest below a cut-off that dips, and rises by 15 degrees to the right of straight ahead, the verge's side.
+    Brightest below a dipped cut-off, which rises by 15 degrees to the right, towards the verge.
     """
     x = np.maximum(away[..., 0], 0.05)
     square = np.maximum((away**2).sum(axis=-1), 0.25)
@@ -106,7 +106,7 @@ def _beam(night: Night, away: Floats) -> tuple[Floats, Floats]:
     below = 1.0 / (1.0 + np.exp(np.clip((rise - cut_off) / 0.004, -40.0, 40.0)))
     down = np.maximum(cut_off - rise, 0.0)
     wide = 0.75 * np.exp(-((bearing / 0.22) ** 2)) + 0.25 * np.exp(-((bearing / 0.6) ** 2))
-    # The near road gets less, so that it is lit as evenly as a lamp can
+    # Less light on the near road, for even illumination
     strength = night.beam_cd * wide * (0.92 * np.exp(-down / 0.05) + 0.08 * np.exp(-down / 0.4))
     ahead = away[..., 0] > 0.0
     return ahead * strength * (below + 0.008) / square, np.maximum(-away[..., 2], 0.0) / np.sqrt(square)
@@ -116,7 +116,7 @@ def _blurred(
     albedo: Floats32, back: Floats32, points: Floats, moves: Floats, camera: Camera, speed_mps: float,
     yaw_rate_radps: float, exposure_s: float,
 ) -> tuple[Floats32, Floats32]:  # fmt: skip
-    """The surfaces as they pass while the shutter is open; the beams go with the car."""
+    """Albedo and retroreflection with motion blur; the beams move with the ego."""
     if exposure_s <= 0.0:
         return albedo, back
     R_cam_ego = np.asarray(camera.ground.R_ego_cam).T
@@ -137,7 +137,7 @@ def _blurred(
 
 
 def _draw_lamps(out: Floats32, rendered: Rendered, scene: Bodies, camera: Camera, T_world_ego: Floats) -> None:
-    """Tail lamps, and the headlamps of who comes towards the ego, added where nothing hides them."""
+    """Adds visible tail lamps, and headlamps of oncoming vehicles."""
     height, width = rendered.depth_m.shape
     R_cam_ego = np.asarray(camera.ground.R_ego_cam).T
     for row in np.flatnonzero((scene.object_id >= 0) & np.isin(scene.kind, (m.VEHICLE, m.TRUCK))):

@@ -1,7 +1,7 @@
-"""What is painted on vehicles and people, for each point in their local coordinates. Compiled by numba.
+"""Appearance of vehicles and people at each point in their local coordinates. Compiled by numba.
 
-Every function gives (red, green, blue, mirror, light): how the surface reflects, how much it mirrors straight on
-(0.04 is lacquer), and light of its own.
+Functions return (red, green, blue, mirror, light): albedo, reflectance at normal incidence (0.04 is lacquer), and
+emitted light.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ def _plate(P, y, z, z_plate):  # type: ignore[no-untyped-def]
 
 @per_pixel
 def apron(P):  # type: ignore[no-untyped-def]
-    """Height of the bare plastic below the bumper's lacquer, m: most cars have some."""
+    """Height in m of the bare plastic below the bumper's lacquer."""
     h = hashed(P[m.SEED], 3.0)
     return 0.2 * max(h - 0.35, 0.0) / 0.65
 
 
 @per_pixel
 def _face(P, y, z, side):  # type: ignore[no-untyped-def]
-    """`_end` of a nose; `side` is |y| as a share of its half width. Makes differ in lamps, grille, intake, strips."""
+    """`_end` of a nose; `side` is |y| relative to its half width. Lamps, grille, intake and strips vary."""
     style, low, top = P[m.LAMPS], P[m.CLEARANCE], P[m.Z_NOSE]
     make_1, make_2, make_3 = hashed(P[m.SEED], 5.0), hashed(P[m.SEED], 6.0), hashed(P[m.SEED], 7.0)
     z_lamp = top - 0.1 - 0.06 * style
@@ -63,7 +63,7 @@ def _face(P, y, z, side):  # type: ignore[no-untyped-def]
         return 1, (0.5 if P[m.GLOSS] > 0.55 and rim else 0.015)
     if side < 0.4 + 0.45 * make_3 and low + 0.05 < z < low + 0.15 + 0.1 * style:
         return 1, 0.015
-    if abs(side - 0.72) < 0.07 and abs(z - low - 0.16) < 0.035:  # fog lamps, or their place
+    if abs(side - 0.72) < 0.07 and abs(z - low - 0.16) < 0.035:  # fog lamps or their recesses
         return (3, 0.3) if make_1 > 0.5 else (1, 0.02)
     if P[m.CLADDING] > 0.5 and abs(z - low - 0.5 * (top - low)) < 0.04:
         return 1, 0.025
@@ -90,7 +90,7 @@ def _end(P, x, y, z, front):  # type: ignore[no-untyped-def]
         z0, z1 = 0.70 * P[m.BELT], P[m.BELT] - 0.02
         if style < 0.35:  # wide lamps
             inner, lo, hi = 0.62, z0 + 0.02, z1
-        elif style < 0.7:  # upright lamps
+        elif style < 0.7:  # vertical lamps
             inner, lo, hi = 0.76, z0 - 0.06, z1 + 0.12
         else:  # lamps at the pillars
             inner, lo, hi = 0.82, z0, min(0.9 * h, z1 + 0.42)
@@ -273,7 +273,7 @@ def cargo(P, bank, pictures, u, v, face, footprint):  # type: ignore[no-untyped-
 
 @per_pixel
 def clothing(P, material, z, height_m):  # type: ignore[no-untyped-def]
-    """Trousers, jacket, hands and face by how high the point is."""
+    """Trousers, jacket, hands and face by height."""
     if material == m.CLOTH:
         return P[m.CARGO_RED], P[m.CARGO_GREEN], P[m.CARGO_BLUE], 0.0, 0.0
     if z > height_m - 0.24:

@@ -1,4 +1,4 @@
-"""From light to the bytes of a camera: weather, exposure, blur, noise, tone, compression. Drawn from a generator."""
+"""Random photometric effects from light to image bytes: weather, exposure, blur, noise, tone, compression."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from birdslam.world.rendering.textures import GRAIN, noise_bank
 
 @dataclass(frozen=True)
 class Lens:
-    """How a camera turns light into bytes."""
+    """Photometric parameters of a camera."""
 
-    exposure: float  # times the mean light of the lower image, that gives middle grey
+    exposure: float  # relative to the metered exposure
     gamma: float
     contrast: float
     tint: tuple[float, float, float]  # of blue, green, red
@@ -31,13 +31,13 @@ class Lens:
     saturation: float
     quality: int  # of JPEG, 0: none
     sharpen: float
-    flare: float = 0.0  # of the mean light, that the glass spreads over all of the image: no black is darker
-    whole: float = 0.0  # how much the upper image, sky and walls, counts when the exposure is metered
-    fixed: float = 0.0  # the light that becomes middle grey where none is metered: all the gain that a camera has
+    flare: float = 0.0  # veiling glare as a fraction of the mean light
+    whole: float = 0.0  # weight of the upper image, sky and walls, in metering
+    fixed: float = 0.0  # light that becomes middle grey without metering, at maximum gain
 
 
 def draw_sky(rng: np.random.Generator) -> Floats:
-    """Light as `light` describes it: noon or low sun, deep or pale shade, overcast, haze, wet road."""
+    """A random sky (see `light`): noon or low sun, deep or pale shade, overcast, haze, wet road."""
     u = rng.random(24)
     sky = np.zeros(SKY_SLOTS)
     overcast = u[0] < 0.28
@@ -56,7 +56,7 @@ def draw_sky(rng: np.random.Generator) -> Floats:
         sky[3:6] *= 0.25 * u[8] if u[8] > 0.4 else 0.0
         sky[6:9] = sky[9:12] = base * (1.4 + u[6]) * np.array([0.96, 0.98, 1.0])
         sky[17] = 0.2 * u[7]
-    elif u[21] < 0.6:  # a dark blue sky gives a sixth of the sun's light and less: the rest is deep in shade
+    elif u[21] < 0.6:  # a dark blue sky gives at most a sixth of the sun's light: deep shade
         sky[6:12] *= 0.25 + 0.45 * u[22]
     sky[12:15] = sky[9:12] * 0.75
     sky[15] = math.exp(math.log(120.0) + u[9] * math.log(60.0)) if u[10] < 0.35 else 4000.0
@@ -69,7 +69,7 @@ def draw_sky(rng: np.random.Generator) -> Floats:
 
 
 def draw_lens(rng: np.random.Generator) -> Lens:
-    """A camera that may be good, dark, overexposed, soft, noisy or grey."""
+    """A random camera: good, dark, overexposed, soft, noisy or grey."""
     u = rng.random(20)
     return Lens(
         exposure=math.exp(rng.normal(0.0, 0.48)),
@@ -90,20 +90,20 @@ def draw_lens(rng: np.random.Generator) -> Lens:
 
 
 def metered(light: Floats32, whole: float) -> float:
-    """The light that becomes middle grey: of the lower image without its brightest, or of all of it."""
+    """The light that becomes middle grey: of the lower image without its brightest pixels, or of the whole image."""
     height, width = light.shape[:2]
     if height <= 8:
         return 1.0
     green = light[::3, ::3, 1]
     lower = np.sort(light[height // 3 :: 3, ::3, 1], axis=None)[: int(0.9 * (height // 3) * width // 3)].mean()
-    # A pixel that is clipped tells the meter no more
+    # Clipped pixels saturate in the meter
     everything = np.minimum(green, 4.0 * max(float(green.mean()), 1e-3)).mean() if whole > 0.0 else 0.0
     return float((1.0 - whole) * lower + whole * everything)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _expose(image, bank, i, j, k, shot, noise, coloured, table, out):  # type: ignore[no-untyped-def]
-    """Grain from `bank` (256, 256), begun at row i, column j, on the image (H, W, 3); then `table` of 1025 levels."""
+    """Adds grain from `bank` (256, 256), offset by row i and column j, to the image (H, W, 3); applies `table`."""
     zero, one, half, rest = np.float32(0.0), np.float32(1.0), np.float32(0.5), np.float32(0.85)
     for row in range(image.shape[0]):
         r0 = (row + i) & 255
@@ -120,7 +120,7 @@ def _expose(image, bank, i, j, k, shot, noise, coloured, table, out):  # type: i
 
 
 def develop(light: Floats32, lens: Lens, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """(H, W, 3) linear BGR light to the image that the camera delivers."""
+    """Converts linear BGR light (H, W, 3) to the camera's image."""
     height, width = light.shape[:2]
     middle = lens.fixed or metered(light, lens.whole)
     image = light * np.float32(0.2 * lens.exposure / max(middle, 1e-3))

@@ -1,4 +1,4 @@
-"""A z-buffer in numba: which triangle is in front at each sample, and shadow maps by the same scan conversion."""
+"""A z-buffer in numba: the front triangle at each sample, and shadow maps by the same scan conversion."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from numba import njit
 from birdslam.world.rendering.compiled import per_pixel
 from birdslam.world.rendering.materials import FOLIAGE
 
-NEAR_M = 0.2  # what is nearer to the camera is cut off
+NEAR_M = 0.2  # near clipping plane
 
 
 @per_pixel
 def _span(x0, y0, x1, y1, x2, y2, row):  # type: ignore[no-untyped-def]
-    """Where a row enters and leaves the triangle; the first greater than the second where it misses it."""
+    """Interval of a row inside the triangle; empty if the first value is greater."""
     left, right = 1e9, -1e9
     for edge in range(3):
         ax, ay = (x0, y0) if edge == 0 else ((x1, y1) if edge == 1 else (x2, y2))
@@ -31,9 +31,9 @@ def _span(x0, y0, x1, y1, x2, y2, row):  # type: ignore[no-untyped-def]
 
 @per_pixel
 def _scan(x, y, w, i, j, k, triangle, nearest, owner, gaps, u, v, mask, masks):  # type: ignore[no-untyped-def]
-    """Keep, at every sample inside the triangle of corners i j k, the greatest w and whose it is.
+    """Keeps, at every sample inside the triangle of corners i j k, the greatest w and its owner.
 
-    With `gaps`, only where the mask has a leaf at (u, v), which is linear in the image on an upright card.
+    With `gaps`, only where the mask has a leaf at (u, v), which is linear in the image on a vertical card.
     """
     x0, y0, w0 = x[i], y[i], w[i]
     x1, y1, w1 = x[j], y[j], w[j]
@@ -91,7 +91,7 @@ def _to_camera(corners, t, c, R, C):  # type: ignore[no-untyped-def]
 
 @per_pixel
 def clip_near(corners, t, R, C, K, attributes, x, y, w, u, v):  # type: ignore[no-untyped-def]
-    """Project triangle t of ego; its part in front of NEAR_M is a fan of so many corners (0, 3 or 4)."""
+    """Projects triangle t in ego; returns the number of corners (0, 3 or 4) of the fan beyond NEAR_M."""
     fx, fy, cx, cy = K[0], K[1], K[2], K[3]
     x0, y0, z0 = _to_camera(corners, t, 0, R, C)
     x1, y1, z1 = _to_camera(corners, t, 1, R, C)
@@ -118,7 +118,7 @@ def clip_near(corners, t, R, C, K, attributes, x, y, w, u, v):  # type: ignore[n
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def rasterize(first, last, corners, attributes, material, R, C, K, masks, nearest, owner):  # type: ignore[no-untyped-def]
-    """The triangles [first, last) into `nearest` (1 / depth) and `owner`, seen by K = (fx, fy, cx, cy) of samples."""
+    """Draws triangles [first, last) to `nearest` (1 / depth) and `owner`; K = (fx, fy, cx, cy) in samples."""
     x, y, w, u, v = np.empty(4), np.empty(4), np.empty(4), np.empty(4), np.empty(4)
     for t in range(first, last):
         n = clip_near(corners, t, R, C, K, attributes, x, y, w, u, v)
@@ -133,7 +133,7 @@ def rasterize(first, last, corners, attributes, material, R, C, K, masks, neares
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def shadow_map(first, last, corners, attributes, material, lean, origin, cells_per_m, masks, highest, owner):  # type: ignore[no-untyped-def]
-    """Height of what is highest on each ray of the sun, by where the ray meets z = 0 of ego.
+    """Height of the highest point on each ray of the sun, indexed by the ray's intersection with z = 0 in ego.
 
     `lean` = (dx, dy) of the sun's direction per metre of height.
     """
@@ -151,7 +151,7 @@ def shadow_map(first, last, corners, attributes, material, lean, origin, cells_p
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def project(first, last, corners, R, C, K):  # type: ignore[no-untyped-def]
-    """x1 y1 x2 y2 around the triangles [first, last) as far as they are in front of the camera; all 0 if nowhere."""
+    """Bounding box x1 y1 x2 y2 of the part of triangles [first, last) in front of the camera; 0 if empty."""
     x, y, w, u, v = np.empty(4), np.empty(4), np.empty(4), np.empty(4), np.empty(4)
     box = np.array([1e9, 1e9, -1e9, -1e9])
     for t in range(first, last):
@@ -166,7 +166,7 @@ def project(first, last, corners, R, C, K):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def count_inside(first, last, corners, R, C, K, stamp, mark):  # type: ignore[no-untyped-def]
-    """How many samples inside the image the triangles [first, last) cover, each counted once; `stamp` gets `mark`."""
+    """Number of distinct samples in the image covered by triangles [first, last); `stamp` gets `mark`."""
     x, y, w, u, v = np.empty(4), np.empty(4), np.empty(4), np.empty(4), np.empty(4)
     height, width = stamp.shape
     total = 0

@@ -1,4 +1,4 @@
-"""A scene of bodies on a street, seen by a camera: meshes, shadows, samples, shading, and the truth about each body."""
+"""Renders bodies on a street: meshes, shadows, samples, shading, and the truth about each body."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _CLASS_OF_KINDS = (
 
 @njit(cache=True, nogil=True)
 def _emit(B, kind, P, ranges):  # type: ignore[no-untyped-def]
-    """The meshes of all bodies in their own frames; their triangles' ranges."""
+    """The meshes of all bodies in their own frames, and the ranges of their triangles."""
     for k in range(kind.shape[0]):
         ranges[k, 0] = B[5][0]
         what = kind[k]
@@ -70,7 +70,7 @@ def _emit(B, kind, P, ranges):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _move(corners, owner, count, R, t):  # type: ignore[no-untyped-def]
-    """From each body's frame to ego."""
+    """Transforms from each body's frame to ego."""
     for k in range(count):
         b = owner[k]
         for c in range(3):
@@ -81,8 +81,10 @@ def _move(corners, owner, count, R, t):  # type: ignore[no-untyped-def]
 
 @dataclass(frozen=True)
 class _Mesh:
-    """All triangles of a scene in ego, as `meshes.new_buffer` has them; of each body (the last is the ground) its range
-    of triangles, parameters and pose in ego."""
+    """All triangles of a scene in ego, in a buffer of `solids.new_buffer`.
+
+    Each body (the last is the ground) has a range of triangles, parameters and a pose in ego.
+    """
 
     corners: Floats32
     attributes: Floats32
@@ -97,7 +99,7 @@ class _Mesh:
 
 
 class _View:
-    """The camera, with `factor` x `factor` samples a pixel: what is in front in it, and where bodies are."""
+    """The camera with `factor` x `factor` samples per pixel: visible triangles, and boxes of bodies."""
 
     def __init__(self, camera: Camera, factor: int) -> None:
         f = factor
@@ -120,7 +122,7 @@ class _View:
         return nearest, front
 
     def boxes(self, mesh: _Mesh, moving: Ints, seen: Ints) -> tuple[Floats, Floats]:
-        """Of each moving body its box (n, 4) in pixels, and the share (n,) of its samples in the image that is seen."""
+        """Box (n, 4) in pixels of each moving body, and the visible fraction (n,) of its samples in the image."""
         boxes, visible = np.full((len(moving), 4), np.nan), np.zeros(len(moving))
         stamp = np.full(self._samples, -1, np.int32)
         height, width = self._size
@@ -148,7 +150,7 @@ class Renderer:
         )  # fmt: skip
 
     def render(self, scene: Bodies, camera: Camera, T_world_ego: Floats, s_m: float) -> Rendered:
-        """The scene from `camera` over the road at `T_world_ego` (4, 4), which is about `s_m` on the street."""
+        """Renders the scene from `camera` at `T_world_ego` (4, 4), near `s_m` on the street."""
         sky, view = self._sky_in_ego(T_world_ego), _View(camera, self.factor)
         mesh = self._mesh(scene, T_world_ego, s_m)
         nearest, front = view.nearest(mesh)
@@ -184,7 +186,7 @@ class Renderer:
         return sky
 
     def _mesh(self, scene: Bodies, T_world_ego: Floats, s_m: float) -> _Mesh:
-        """The triangles of all bodies, and after them those of the ground. Raises ValueError where they do not fit."""
+        """The triangles of all bodies, then those of the ground. Raises ValueError if there are too many."""
         R, t = self._poses(scene, T_world_ego)
         B = new_buffer(_CAPACITY)
         corners, attributes, normals, material, owner, counts = B
@@ -202,7 +204,7 @@ class Renderer:
         return _Mesh(corners, attributes, normals, material, owner, count, ranges, parameters, R, t)
 
     def _poses(self, scene: Bodies, T_world_ego: Floats) -> tuple[Floats, Floats]:
-        """Rotations (n + 1, 3, 3) and places (n + 1, 3) in ego; the last is the ground's: its corners are in world."""
+        """Rotations (n + 1, 3, 3) and positions (n + 1, 3) in ego; the last is that of the ground, in world."""
         c, s = np.cos(scene.yaw_rad), np.sin(scene.yaw_rad)
         norm = 1.0 / np.sqrt(1.0 + np.square(scene.slope))
         cp, sp = norm, scene.slope * norm  # x axis climbs by the slope
@@ -217,14 +219,14 @@ class Renderer:
 
     @staticmethod
     def _face_cards(scene: Bodies, parameters: Floats32, R: Floats, t: Floats) -> None:
-        """Cards of leaves turn to the camera: its direction from each body, in the body's frame."""
+        """Turns cards of leaves to the camera: writes its direction in each body's frame."""
         towards = -np.einsum("nji,nj->ni", R[:-1], t[:-1])[:, :2]
         towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-6)
         cards = np.isin(scene.kind, (m.TREE, m.HEDGE))
         parameters[:-1, 13:15][cards] = towards[cards]
 
     def _stations(self, s_m: float) -> Floats:
-        """Where the ground's strips have their seams: on whole metres, so that they stay put while the ego drives."""
+        """Seams of the ground's strips, at whole metres so that they are fixed while the ego moves."""
         base = math.floor(s_m / 4.0) * 4.0
         s = np.concatenate([np.arange(-8.0, 32.0, 1.0), np.arange(32.0, 80.0, 2.0), np.arange(80.0, 260.0, 4.0)]) + base
         s = s[(s >= 0.0) & (s <= self.street.length_m)]
@@ -261,14 +263,14 @@ class Renderer:
         wide = moving[np.isin(scene.kind[moving], (m.VEHICLE, m.TRUCK))]
         poses = np.column_stack([t[wide, 0], t[wide, 1], np.arctan2(R[wide, 1, 0], R[wide, 0, 0])])
         sizes = scene.parameters[wide][:, [m.LENGTH, m.WIDTH]].astype(np.float64)
-        seed = float(self._sky[18])  # how soft these shadows are differs from scene to scene
+        seed = float(self._sky[18])  # varies the softness of these shadows
         at_edge, reach_m = 0.3 + 0.3 * seed, 0.4 + 2.0 * hashed(seed, 5.0) ** 2
         contact_map(shade_map, -2.0, -16.0, 5.0, np.ascontiguousarray(poses), sizes, at_edge, reach_m)
         return shade_map, np.array([-2.0, -16.0, 5.0])
 
 
 def _classes(scene: Bodies) -> NDArray[np.uint8]:
-    """(bodies + 1,): the class of each body, 0 where its materials tell theirs, as the ground's do."""
+    """The class of each body (bodies + 1,), 0 if it depends on the material, as for the ground."""
     out = np.zeros(len(scene.kind) + 1, np.uint8)
     for kinds, label in _CLASS_OF_KINDS:
         out[:-1][np.isin(scene.kind, kinds)] = label
@@ -276,7 +278,7 @@ def _classes(scene: Bodies) -> NDArray[np.uint8]:
 
 
 def _marks_by_metre(street: Street) -> NDArray[np.int16]:
-    """(metres, 12): which marks lie on each metre of the street, -1 after the last."""
+    """Indices of the marks on each metre of the street (metres, 12), -1 after the last."""
     out = np.full((int(street.length_m) + 2, 12), -1, np.int16)
     used = np.zeros(len(out), np.int64)
     for k, (s0, s1) in enumerate(street.marks[:, 1:3].tolist()):

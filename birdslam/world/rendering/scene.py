@@ -1,4 +1,4 @@
-"""What is rendered, and what comes of it: numpy alone, so that who places bodies needs no numba."""
+"""Input and output of the renderer; numpy only, so that placing bodies needs no numba."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from birdslam.geometry.arrays import Bools, Floats, Floats32, Ints
 
 @dataclass(frozen=True)
 class Bodies:
-    """What is in the world, row by row: its kind of mesh and the mesh's parameters (`materials`), its pose in world."""
+    """Bodies in the world, row by row: kind of mesh, parameters (`materials`), pose in world."""
 
     kind: NDArray[np.int32]
     parameters: Floats32  # (n, SLOTS)
     position_m: Floats  # (n, 3) in world
     yaw_rad: Floats
-    slope: Floats  # of the road under it along its own x, dz/dx; 0 for what stands upright on a slope
-    object_id: NDArray[np.int32]  # -1 for what can't move
+    slope: Floats  # of the road under it along its x, dz/dx; 0 for bodies that are vertical on a slope
+    object_id: NDArray[np.int32]  # -1 for static bodies
 
     def subset(self, keep: Bools) -> Bodies:
         """The rows to keep."""
@@ -39,6 +39,6 @@ class Rendered:
     depth_m: Floats32
     classes: NDArray[np.uint8]
     instances: NDArray[np.uint16]
-    boxes_px: Floats  # of bodies that move, in the order of `moving`
+    boxes_px: Floats  # of movable bodies, in the order of `moving`
     moving: Ints
-    visible: Floats  # of each of them: the share of its samples inside the image that nothing hides
+    visible: Floats  # of each of them: unoccluded fraction of its samples inside the image

@@ -1,8 +1,8 @@
-"""From triangles in front to light: one pass over the pixels of a frame. Compiled by numba.
+"""Shading of the visible triangles: one pass over the pixels of a frame. Compiled by numba.
 
-`shade` goes through what happens at one point: where it is on its triangle (`coordinates`), which way that faces
-(`unit_normal`), what it is painted with (`surface`), and what light falls on it (`sunlight`, `skylight`, `glossed`,
-`hazed` in `light`). `scene` and `look` are what `shade_frame` describes.
+`shade` computes one point: its position on the triangle (`coordinates`), the normal (`unit_normal`), the material
+(`surface`), and its light (`sunlight`, `skylight`, `glossed`, `hazed` in `light`). `shade_frame` describes `scene` and
+`look`.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from birdslam.world.rendering.compiled import inlined, per_pixel
 from birdslam.world.rendering.ground import shade_ground
 from birdslam.world.rendering.light import glossed, hazed, sky_colour, skylight, sunlight
 
-# Class of each material, in the order of `materials`; the ground's and a vehicle's panels tell theirs
+# Class of each material, in the order of `materials`; those of ground and vehicle panels depend on the point
 MATERIAL_CLASS = np.array([1, 7, 7, 7, 4, 9, 5, 5, 6, 6, 8, 9, 4, 9, 9, 8], np.uint8)
 OTHER_CLASS = 9
 
 
 @inlined
 def hit(bases, t, C, ray):  # type: ignore[no-untyped-def]
-    """Depth where the ray C + depth * ray meets the plane of triangle t; negative where it does not."""
+    """Depth of the intersection of C + depth * ray with the plane of triangle t; negative without one."""
     nx, ny, nz = bases[t, 0], bases[t, 1], bases[t, 2]
     down = nx * ray[0] + ny * ray[1] + nz * ray[2]
     if abs(down) < 1e-12:
@@ -54,13 +54,13 @@ def plane_bases(corners, count, bases):  # type: ignore[no-untyped-def]
 
 @inlined
 def side_inclination(P, z):  # type: ignore[no-untyped-def]
-    """How far a body's side leans in at the height z over the road: its normal's fall per its level part."""
+    """Inclination of a body's side at the height z over the road: slope of its normal."""
     return (0.5 + 0.9 * P[m.SEED]) * min(max(1.0 - (z - P[m.CLEARANCE]) / (0.25 + 0.2 * P[m.RIM]), 0.0), 1.0)
 
 
 @inlined
 def coordinates(t, x, y, z, scene):  # type: ignore[no-untyped-def]
-    """(u, v, w) that the point (x, y, z) of triangle t is painted by, and its normal in its body's frame."""
+    """Texture coordinates (u, v, w) of the point (x, y, z) of triangle t, and its normal in the body's frame."""
     bases, attributes, normals, material, _, _, _, _, _ = scene
     b = bases[t, 4] * x + bases[t, 5] * y + bases[t, 6] * z + bases[t, 7]
     c = bases[t, 8] * x + bases[t, 9] * y + bases[t, 10] * z + bases[t, 11]
@@ -73,7 +73,7 @@ def coordinates(t, x, y, z, scene):  # type: ignore[no-untyped-def]
     ly = a * normals[t, 0, 1] + b * normals[t, 1, 1] + c * normals[t, 2, 1]
     lz = a * normals[t, 0, 2] + b * normals[t, 1, 2] + c * normals[t, 2, 2]
     if material[t] not in (m.GROUND, m.PAINT, m.SKIN):
-        w = attributes[t, 0, 2] + 0.0  # which face, exactly
+        w = attributes[t, 0, 2] + 0.0  # exact number of the face
     return u, v, w, lx, ly, lz
 
 
@@ -91,9 +91,9 @@ def unit_normal(P, R, mat, w, lx, ly, lz):  # type: ignore[no-untyped-def]
 
 @inlined
 def surface(P, mat, own_class, mask, look, u, v, w, lx, ly, lz, z, foot, facing):  # type: ignore[no-untyped-def]
-    """(red, green, blue, mirror, light, class): how a material reflects at (u, v, w), and light of its own.
+    """(red, green, blue, mirror, light, class) of a material at (u, v, w), with its emitted light.
 
-    `own_class` is the body's, 0 where its materials tell theirs; `foot` is the pixel's width on the surface in metres.
+    `own_class` is the body's, 0 if it depends on the material; `foot` is the pixel's width on the surface in metres.
     """
     bank, masks, pictures, sky, _, ground, _, _ = look
     label = MATERIAL_CLASS[mat]
@@ -134,7 +134,7 @@ def surface(P, mat, own_class, mask, look, u, v, w, lx, ly, lz, z, foot, facing)
 
 @inlined
 def shade(t, depth, C, ray, scene, look, out):  # type: ignore[no-untyped-def]
-    """Light of triangle t along the ray at a depth into out[:3], its class into out[3]."""
+    """Writes the light of triangle t at a depth along the ray to out[:3], its class to out[3]."""
     _, attributes, _, material, owner, P_all, R_all, labels, _ = scene
     bank, _, _, sky, maps, _, contact, pixel_rad = look
     mat, k = material[t], owner[t]
@@ -149,7 +149,7 @@ def shade(t, depth, C, ray, scene, look, out):  # type: ignore[no-untyped-def]
         P, mat, labels[k], attributes[t, 0, 2], look, u, v, w, lx, ly, lz, z, depth * pixel_rad, facing
     )
     bias, soft = 0.0, 0.0
-    if mat == m.FOLIAGE:  # leaves lie every way, and let light through
+    if mat == m.FOLIAGE:  # leaves have random normals and are translucent
         nx, ny, nz = 0.35 * (nx - ex), 0.35 * (ny - ey), 0.65
         bias, soft, facing = 0.35, 0.5, 1.0
     elif facing < 0.0:
@@ -169,7 +169,7 @@ def shade(t, depth, C, ray, scene, look, out):  # type: ignore[no-untyped-def]
 
 @inlined
 def triangles_of(row, column, factor, owner, nearest, of_body, seen, counts, inverse, visible):  # type: ignore[no-untyped-def]
-    """How many triangles a pixel's samples show: whose into `seen`, in how many samples, and 1 / depth of the first."""
+    """Number of triangles in a pixel's samples; writes their indices, sample counts, and first 1 / depth."""
     kinds = 0
     for i in range(row * factor, (row + 1) * factor):
         for k in range(column * factor, (column + 1) * factor):
@@ -190,7 +190,7 @@ def triangles_of(row, column, factor, owner, nearest, of_body, seen, counts, inv
 
 @inlined
 def merge_smooth(kinds, of_body, material, seen, counts, inverse):  # type: ignore[no-untyped-def]
-    """How many are left when triangles of one material of one body, which are shaded once, become one."""
+    """Merges triangles of the same material and body, which are shaded once; returns the remaining number."""
     merged = 0
     for j in range(kinds):
         same = -1
@@ -215,10 +215,10 @@ def merge_smooth(kinds, of_body, material, seen, counts, inverse):  # type: igno
 def shade_frame(  # type: ignore[no-untyped-def]
     nearest, owner, factor, R, C, K, scene, look, image, depth_m, classes, instances, visible, spare
 ):  # fmt: skip
-    """Every pixel of samples `factor` x `factor`: image (H, W, 3) linear BGR, depth, classes, instances.
+    """Shades all pixels of `factor` x `factor` samples: image (H, W, 3) linear BGR, depth, classes, instances.
 
-    R turns camera to ego; K = (fx, fy, cx, cy) of pixels. `visible` counts the samples of each body. `spare` is room
-    for a ray, an answer, and the triangles of one pixel's samples: whose, how many, and 1 / depth of the first.
+    R rotates camera to ego; K = (fx, fy, cx, cy) in pixels. `visible` counts the samples of each body. `spare` is a
+    buffer for a ray, a result, and the triangles of one pixel's samples.
 
     `scene` = (plane_bases, attributes, normals, material and body of each triangle; parameters, rotation, class and
     instance of each body); `look` = (noise_bank, foliage_masks, pictures, sky, shadow maps, ground, contact map, rad a
@@ -262,7 +262,7 @@ def shade_frame(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def wet_road(light, classes, wetness):  # type: ignore[no-untyped-def]
-    """What stands over a wet road shows in it upside down, the more the flatter it is seen; in place."""
+    """Adds reflections of the scene in a wet road, stronger at grazing angles; in place."""
     height, width = classes.shape
     copy = light.copy()
     for column in range(width):
@@ -278,7 +278,7 @@ def wet_road(light, classes, wetness):  # type: ignore[no-untyped-def]
             k = wetness * (0.5 * (1.0 - share) ** 2 + 0.08) * (0.5 if label == 3 else 1.0)
             for channel in range(3):
                 mean = 0.0
-                for j in range(4):  # the road's roughness draws reflections out
+                for j in range(4):  # the road's roughness blurs reflections vertically
                     mirror = 2 * foot - row - j * (1 + (row - foot) // 8)
                     mean += 0.25 * min(copy[max(mirror, 0), column, channel], 4.0)
                 light[row, column, channel] += k * (mean - light[row, column, channel])

@@ -1,4 +1,4 @@
-"""Facades, roofs, leaves, plates and other standing surfaces, painted from their coordinates. Compiled by numba."""
+"""Procedural textures of facades, roofs, leaves, plates and other vertical surfaces. Compiled by numba."""
 
 from __future__ import annotations
 
@@ -106,9 +106,9 @@ def _windows(P, u, v, face, long, storey, r, g, b):  # type: ignore[no-untyped-d
 
 @per_pixel
 def facade(P, bank, pictures, u, v, face, foot):  # type: ignore[no-untyped-def]
-    """(r, g, b, mirror) of a house: its roof, or its wall with what is in it."""
+    """(r, g, b, mirror) of a house: its roof, or its wall with windows and doors."""
     if face < 4.0:
-        v -= 1.0  # walls begin 1 m below the ground
+        v -= 1.0  # walls start 1 m below the ground
     if face >= 4.0 and face != 6.0:
         return _roof(P, bank, u, v, foot)
     r, g, b = _wall(P, bank, u, v, face, foot)
@@ -130,7 +130,7 @@ def facade(P, bank, pictures, u, v, face, foot):  # type: ignore[no-untyped-def]
 
 @per_pixel
 def leaves(P, masks, u, v, mask):  # type: ignore[no-untyped-def]
-    """(r, g, b) of leaves at (u, v) of a mask, and how far up the crown is lit."""
+    """(r, g, b) of leaves at (u, v) of a mask, with light by height in the crown."""
     i = min(max(int(u * masks.shape[2]), 0), masks.shape[2] - 1)
     j = min(max(int(v * masks.shape[1]), 0), masks.shape[1] - 1)
     k = masks[int(mask), j, i] / 255.0

@@ -1,4 +1,4 @@
-"""Natural textures: tileable 1/f noise with its coarser levels, cracks, and masks of foliage; made once from a seed."""
+"""Natural textures from a seed: tileable 1/f noise with coarser levels, cracks, and masks of foliage."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def noise_bank() -> Floats32:
     cloud = _coloured(rng, 1.1)
     grain = _coloured(rng, 0.25)
     winding = _coloured(rng, 1.6)
-    # A crack runs where smooth noise crosses zero, here and there
+    # Cracks follow the zero crossings of smooth noise
     crack = np.exp(-np.square(winding / 0.022)) * (_coloured(rng, 1.3) > 0.35)
     clump = np.abs(_coloured(rng, 0.8)) - 0.8
     bank = np.zeros((4, LEVELS, SIZE_PX, SIZE_PX), np.float32)
@@ -49,7 +49,7 @@ def noise_bank() -> Floats32:
 
 @cache
 def foliage_masks() -> NDArray[np.uint8]:
-    """(MASKS, MASK_PX, MASK_PX): 0 is a gap, else how light the leaves are (1-255); row 0 is the top of the crown."""
+    """Masks (MASKS, MASK_PX, MASK_PX): 0 is a gap, else brightness of leaves (1-255); row 0 is the top of the crown."""
     rng = np.random.default_rng(20260102)
     y, x = np.mgrid[-1 : 1 : MASK_PX * 1j, -1 : 1 : MASK_PX * 1j]
     out = np.zeros((MASKS, MASK_PX, MASK_PX), np.uint8)

@@ -1,7 +1,7 @@
 """A camera with faults for every Python process whose path has this folder; for the fault suite alone (faults.py).
 
 With FAULTY_CAMERA=DIR, cv2.VideoCapture shows DIR/frames.npy in a loop, DIR/rate_hz frames a second, and does what
-DIR/fault says: "", gone, frozen, black, torn, late, disorder, or clock_step (UTC an hour off).
+DIR/fault contains: "", gone, frozen, black, torn, late, disorder, or clock_step (UTC an hour off).
 """
 
 import os
@@ -47,7 +47,7 @@ if FOLDER:
             now_s = time.monotonic()
             self._due_s = max(self._due_s + 1.0 / self._rate_hz, now_s - 1.0 / self._rate_hz)
             time.sleep(max(0.0, self._due_s - now_s) + (0.4 if fault == "late" else 0.0))
-            # frames that nobody reads are skipped: the image follows from the time
+            # unread frames are skipped: the time determines the image
             before, self._number = self._number, int(time.monotonic() * self._rate_hz)
             self._shown = before if fault == "frozen" else self._number
             if fault == "frozen":

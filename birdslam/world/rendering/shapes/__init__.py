@@ -1,1 +1,1 @@
-"""Meshes of what is rendered: solids, vehicles, people, and what stands beside the street. Compiled by numba."""
+"""Meshes: solids, vehicles, people, and scenery. Compiled by numba."""

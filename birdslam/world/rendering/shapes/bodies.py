@@ -1,7 +1,7 @@
-"""Meshes of what moves: cars, vans, buses, pedestrians, cyclists. Compiled by numba.
+"""Meshes of road users: cars, vans, buses, pedestrians, cyclists. Compiled by numba.
 
-A car is a loft: cross-sections from tail to nose under a profile of bonnet, screens and roof. What is painted on it
-(windows, lamps, plates, door gaps) is decided for each pixel from its local coordinates, in `paint`.
+A car is a loft: cross-sections from tail to nose under a profile of bonnet, screens and roof. `paint` adds windows,
+lamps, plates and door gaps per pixel.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from birdslam.world.rendering.shapes.solids import ball, begin, box, corner, lim
 
 STATIONS = 15
 RIBS = 8  # points of half a cross-section
-TRACK_RATIO = 0.935  # over the tyres' outer sides, of a vehicle's width
+TRACK_RATIO = 0.935  # width over the tyres relative to a vehicle's width
 
 
 @njit(cache=True, nogil=True)
@@ -62,7 +62,7 @@ def roof_half_width(P, x, z):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _stations(P, x0, x1):  # type: ignore[no-untyped-def]
-    """(STATIONS,) x of the cross-sections from tail to nose: where the profile bends, and between."""
+    """x (STATIONS,) of the cross-sections from tail to nose: at bends of the profile, and between."""
     xs = np.empty(STATIONS)
     xs[0], xs[1], xs[2] = x0, x0 + 0.04, x0 + 0.13
     xs[3] = max(P[m.X_BACK_BOTTOM], x0 + 0.18)
@@ -92,7 +92,7 @@ def _cross_sections(P, x0, x1):  # type: ignore[no-untyped-def]
         glass = top - belt
         shoulder = roof_half_width(P, x, top) if glass > 0.02 else 0.94 * w
         flat = 0.03 if glass < 0.02 else 0.0
-        # Below its wings a body is narrower than its track: the tyres stand under it, not beside it
+        # Below its wings a body is narrower than its track, so that the tyres are under it
         sill = min(max(low + 0.35 * (belt - low), 1.7 * P[m.WHEEL_RADIUS]), low + 0.7 * (belt - low))
         wing = min(max(low + 0.6 * (belt - low), sill + 0.1), low + 0.8 * (belt - low))
         rows = (
@@ -167,7 +167,7 @@ def vehicle(B, body, P):  # type: ignore[no-untyped-def]
     """Car, van or bus: the loft on four wheels with its mirrors."""
     loft(B, body, P)
     y, r = 0.5 * P[m.WIDTH], P[m.WHEEL_RADIUS]
-    # Exhaust, axles and tank close the view under a car
+    # Exhaust, axles and tank block the view under a car
     box(
         B, body, m.DARK, P[m.X_REAR_AXLE] - 0.6 * r, P[m.X_FRONT_AXLE], -0.6 * y, 0.6 * y,
         (0.55 + 0.3 * P[m.SEED]) * P[m.CLEARANCE], P[m.CLEARANCE] + 0.12,
@@ -194,9 +194,9 @@ def vehicle(B, body, P):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def person(B, body, P, z_hip, lean, seated, holds):  # type: ignore[no-untyped-def]
-    """Legs, trunk, arms and head of someone HEIGHT tall whose hip is at `z_hip`; clothes are distinguished by face.
+    """Legs, trunk, arms and head of a person of HEIGHT with the hip at `z_hip`; the face number selects the clothes.
 
-    Who `holds` has both hands on a bar ahead.
+    With `holds` both hands are on a bar ahead.
     """
     h = P[m.HEIGHT] if not seated else 1.75
     k = h / 1.75
@@ -239,13 +239,13 @@ def person(B, body, P, z_hip, lean, seated, holds):  # type: ignore[no-untyped-d
 
 @njit(cache=True, nogil=True)
 def pedestrian(B, body, P):  # type: ignore[no-untyped-def]
-    """Someone on foot, with both hands on a bar where GLOSS is over 0.5."""
+    """A pedestrian, with both hands on a bar if GLOSS is over 0.5."""
     person(B, body, P, 0.5 * P[m.HEIGHT], 0.03, False, P[m.GLOSS] > 0.5)
 
 
 @njit(cache=True, nogil=True)
 def pram(B, body, P):  # type: ignore[no-untyped-def]
-    """What a pedestrian P pushes: a tub with a hood on four wheels."""
+    """A pram in front of a pedestrian P: a tub with a hood on four wheels."""
     x_bar, z_bar = 0.39, 0.61 * P[m.HEIGHT]
     for s in (-1.0, 1.0):
         wheel(B, body, m.WHEEL, x_bar + 0.25, 0.22 * s, s, 0.14, 0.05)
@@ -268,7 +268,7 @@ def _ring(B, body, x, r, thickness):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def cyclist(B, body, P):  # type: ignore[no-untyped-def]
-    """Someone on a bicycle, or, where GLOSS is over 0.5, on a motor scooter."""
+    """A person on a bicycle, or on a motor scooter if GLOSS is over 0.5."""
     if P[m.GLOSS] > 0.5:
         for x in (-0.62, 0.62):
             wheel(B, body, m.WHEEL, x, 0.06, 1.0, 0.3, 0.12)

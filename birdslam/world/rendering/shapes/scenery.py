@@ -1,4 +1,4 @@
-"""Meshes of what stands: buildings, trees, hedges, posts, signs, fences, bridges. Compiled by numba."""
+"""Meshes of scenery: buildings, trees, hedges, posts, signs, fences, bridges. Compiled by numba."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from birdslam.world.rendering.shapes.solids import ball, begin, box, card, corne
 
 @njit(cache=True, nogil=True)
 def _hash(a, b):  # type: ignore[no-untyped-def]
-    """A number in [0, 1) of two others, without pattern."""
+    """A pseudo-random number in [0, 1) from two numbers."""
     v = math.sin(a * 127.1 + b * 311.7) * 43758.5453
     return v - math.floor(v)
 
@@ -161,7 +161,7 @@ def lights(B, body, P):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def crate(B, body, P):  # type: ignore[no-untyped-def]
-    """Containers, bins, kiosks, cabinets: boxes that are no cars."""
+    """Containers, bins, kiosks, cabinets: boxes that are not cars."""
     hx, hy, h = 0.5 * P[m.LENGTH], 0.5 * P[m.WIDTH], P[m.HEIGHT]
     if P[8] == 1.0:
         box(B, body, m.PLAIN, -hx, hx, -hy, hy, 0.08, 0.9 * h)

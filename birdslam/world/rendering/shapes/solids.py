@@ -2,7 +2,7 @@
 
 `B` is the buffer of triangles that every function here appends to:
 (corners (N, 3, 3), attributes (N, 3, 3), normals (N, 3, 3), material (N,), body (N,), (how many, how many not)).
-Attributes are what a material is painted by: local coordinates, or (u, v, face) in metres on flat faces.
+Attributes are texture coordinates: local coordinates, or (u, v, face) in metres on flat faces.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ Buffer = tuple[Any, ...]
 
 
 def new_buffer(capacity: int) -> Buffer:
-    """Room for so many triangles; those that do not fit are counted."""
+    """A buffer for `capacity` triangles; further ones are only counted."""
     return (
         np.empty((capacity, 3, 3), np.float32),
         np.empty((capacity, 3, 3), np.float32),
@@ -30,7 +30,7 @@ def new_buffer(capacity: int) -> Buffer:
 
 @njit(cache=True, nogil=True)
 def corner(B, k, i, x, y, z, a, b, c, nx, ny, nz):  # type: ignore[no-untyped-def]
-    """Corner i of triangle k: where it is, its attributes, its normal."""
+    """Sets corner i of triangle k: position, attributes, normal."""
     B[0][k, i, 0], B[0][k, i, 1], B[0][k, i, 2] = x, y, z
     B[1][k, i, 0], B[1][k, i, 1], B[1][k, i, 2] = a, b, c
     B[2][k, i, 0], B[2][k, i, 1], B[2][k, i, 2] = nx, ny, nz
@@ -38,7 +38,7 @@ def corner(B, k, i, x, y, z, a, b, c, nx, ny, nz):  # type: ignore[no-untyped-de
 
 @njit(cache=True, nogil=True)
 def begin(B, body, material, triangles):  # type: ignore[no-untyped-def]
-    """Index of the first of so many new triangles, -1 where there is no room."""
+    """Index of the first of new triangles, -1 if the buffer is full."""
     k = B[5][0]
     if k + triangles > B[3].shape[0]:
         B[5][1] += triangles
@@ -78,7 +78,7 @@ def box(B, body, material, x0, x1, y0, y1, z0, z1):  # type: ignore[no-untyped-d
          (0.0, -1.0, 0.0), 0.0, 0.0, lx, lz, 3.0)  # fmt: skip
     quad(B, body, material, (x0, y0, z1), (x1, y0, z1), (x1, y1, z1), (x0, y1, z1),
          (0.0, 0.0, 1.0), 0.0, 0.0, lx, ly, 4.0)  # fmt: skip
-    if z0 > 0.5:  # high enough that one sees it from below
+    if z0 > 0.5:  # visible from below
         quad(B, body, material, (x0, y1, z0), (x1, y1, z0), (x1, y0, z0), (x0, y0, z0),
              (0.0, 0.0, -1.0), 0.0, 0.0, lx, ly, 5.0)  # fmt: skip
 
@@ -149,7 +149,7 @@ def ball(B, body, material, x, y, z, rx, ry, rz):  # type: ignore[no-untyped-def
 
 @njit(cache=True, nogil=True)
 def wheel(B, body, material, x, y, side, r, width):  # type: ignore[no-untyped-def]
-    """A wheel standing on the ground whose outer disc lies at y; attributes (x / r, z / r, 1) there, 0 on the tread."""
+    """A wheel on the ground with its outer disc at y; attributes (x / r, z / r, 1) there, 0 on the tread."""
     sides = 12
     k = begin(B, body, material, 3 * sides)
     if k < 0:
@@ -172,7 +172,7 @@ def wheel(B, body, material, x, y, side, r, width):  # type: ignore[no-untyped-d
 
 @njit(cache=True, nogil=True)
 def card(B, body, material, x, y, z, ux, uy, width, height, mask):  # type: ignore[no-untyped-def]
-    """An upright picture with gaps, its bottom centre at (x, y, z), along the direction (ux, uy)."""
+    """A vertical picture with gaps, its bottom centre at (x, y, z), along the direction (ux, uy)."""
     hx, hy = 0.5 * width * ux, 0.5 * width * uy
     n = (0.0, 0.0, 1.0)
     quad(

@@ -1,4 +1,4 @@
-"""Meshes of trucks: a cab, a chassis with what hangs on it, and what is carried. Compiled by numba."""
+"""Meshes of trucks: cab, chassis with attachments, and load. Compiled by numba."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from birdslam.world.rendering.shapes.solids import box, limb, wheel
 
 @njit(cache=True, nogil=True)
 def _side(B, body, P, s, x0, x1):  # type: ignore[no-untyped-def]
-    """Between the axles of a truck without a skirt: two bars, and behind the cab a fuel tank or a box of tools."""
+    """The side between the axles of a truck without a skirt: two bars, and a fuel tank or a toolbox behind the cab."""
     y, z0 = 0.5 * P[m.WIDTH], P[m.CARGO_Z0]
     for bar in range(2):
         z = 0.5 + 0.5 * bar * (z0 - 0.55)
@@ -44,7 +44,7 @@ def _side(B, body, P, s, x0, x1):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _load(B, body, P):  # type: ignore[no-untyped-def]
-    """What is carried: a tank, a flat bed with its load, a mixer, or a box."""
+    """The load: a tank, a flat bed with its load, a mixer, or a box."""
     y, x0, x1 = 0.5 * P[m.WIDTH], P[m.CARGO_X0], P[m.CARGO_X1]
     z0, z1 = P[m.CARGO_Z0], P[m.HEIGHT]
     kind = int(P[m.CARGO_KIND])
@@ -71,7 +71,7 @@ def _load(B, body, P):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def truck(B, body, P):  # type: ignore[no-untyped-def]
-    """A cab, a chassis with wheels, and what it carries."""
+    """A truck: cab, chassis with wheels, and load."""
     loft(B, body, P)
     y, r, x0, z0 = 0.5 * P[m.WIDTH], P[m.WHEEL_RADIUS], P[m.CARGO_X0], P[m.CARGO_Z0]
     box(B, body, m.DARK, x0 + 0.15, P[m.LOFT_X0] + 0.4, -0.45, 0.45, 0.55, z0)
