@@ -1,11 +1,11 @@
-"""Monocular multibody SLAM in bird's-eye view: what a program imports. docs/planner.md is its page.
+"""Monocular multibody SLAM in bird's-eye view: the public API (docs/planner.md).
 
     slam = BirdSLAM.with_shipped_networks(recording.camera, recording.rate_hz)
     for frame in recording.undistorted_frames():  # open_recording("video:drive.mp4", load_camera(Path("camera.toml")))
         measurements, estimate = slam.step(frame)
 
-A name is loaded when it is first asked for: BLAS reads the number of its threads from the environment when numpy is
-loaded, and `runtime/environment.py` sets it first.
+Names are loaded on first use: BLAS reads its number of threads from the environment when numpy is imported, and
+`runtime/environment.py` must set it before.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:  # the same names, for editors and mypy; a test holds them to `_MODULES`
+if TYPE_CHECKING:  # the same names, for editors and mypy; a test compares them with `_MODULES`
     from birdslam.frontend import FrontEnd as FrontEnd
     from birdslam.geometry.camera import Camera as Camera
     from birdslam.geometry.camera import Undistorter as Undistorter
@@ -73,7 +73,7 @@ __all__ = sorted(_MODULES)
 
 
 def __getattr__(name: str) -> Any:
-    """The public names, loaded when they are first asked for (PEP 562)."""
+    """Loads a public name on first use (PEP 562)."""
     if name not in _MODULES:
         raise AttributeError(f"module 'birdslam' has no attribute {name!r}")
     value = getattr(import_module(_MODULES[name]), name)

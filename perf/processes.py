@@ -4,25 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import socket
-import subprocess
 import sys
 from collections.abc import Collection
 
 import psutil
 
-from birdslam.perf.errors import PerfError
-
 
 def birdslam_command(*arguments: str) -> list[str]:
     """The command line of `birdslam` with this interpreter."""
     return [sys.executable, "-m", "birdslam.runtime.cli.main", *arguments]
-
-
-def run_birdslam(*arguments: str) -> None:
-    """Runs `birdslam`. Raises PerfError with its message if it fails."""
-    done = subprocess.run(birdslam_command(*arguments), capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise PerfError(done.stderr.strip())
 
 
 def processes_of(pid: int, names: Collection[str]) -> dict[str, psutil.Process]:

@@ -182,7 +182,7 @@ def test_edge_sigma_follows_the_detector_family(tmp_path: Path) -> None:
     own = EdgeSigma((0.01, 0.02, 0.03, 0.04), 0.5)
     theirs = [Corners(np.array([[10.0, 20.0], [40.0, 60.0]]))]
     assert norfair_adapter.from_norfair(theirs, detector=own).edge_sigma == own
-    with pytest.raises(ValueError, match="no family of detectors 'yolo'; there are rrc, yolox"):
+    with pytest.raises(ValueError, match="unknown detector family 'yolo'; expected one of rrc, yolox"):
         external_detections(boxes, labels, detector="yolo")  # type: ignore[arg-type]
     file = tmp_path / "boxes.txt"
     file.write_text("1,-1,10,20,30,40,0.9\n")

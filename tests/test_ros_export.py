@@ -243,7 +243,7 @@ def test_export_errors_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[s
     drive = str(recording(tmp_path / "d.mcap"))
     (tmp_path / "there").mkdir()
     for arguments, said in (
-        ([drive, "--ros2", str(tmp_path / "there")], "there: is there already"),
+        ([drive, "--ros2", str(tmp_path / "there")], "there: exists already"),
         ([str(tmp_path / "none.mcap"), "--ros2", str(tmp_path / "x")], "none.mcap: can't be read"),
         ([str(recording(tmp_path / "e.mcap", records=())), "--ros2", str(tmp_path / "x")], "has no estimate"),
         ([str(recording(tmp_path / "f.mcap", camera=None)), "--ros2", str(tmp_path / "x")], "has no camera"),

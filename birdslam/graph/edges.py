@@ -1,4 +1,4 @@
-"""The pose edges of one frame (Eq. 6), without those that can't be measurements."""
+"""The valid pose edges of one frame (Eq. 6)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from birdslam.geometry.arrays import Complexes, Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.types import EgoEdge, Measurements, MotionEdge, VehicleEdge
 
-LARGEST_M = 1e5  # maximum length and variance of a valid edge
+MAX_M = 1e5  # maximum length and variance of a valid edge
 _MIN_COV = 1e-12
 
 
@@ -51,7 +51,7 @@ class VvEdges:
 def pose_edges(m: Measurements) -> PoseEdges:
     """Returns one CV and one VV edge for each vehicle (the last one of the record).
 
-    Invalid edges are left out: a matrix that is no covariance, or a length beyond LARGEST_M.
+    Invalid edges are left out: a matrix that is no covariance, or a length beyond MAX_M.
     """
     frame, cc = m.frame_id, m.cc
     cv = [*{e.vehicle: e for e in m.cv if e.frame == frame}.values()]
@@ -72,15 +72,15 @@ def _numbers(parts: list[tuple[float, ...]]) -> Floats:
 
 
 def _is_valid(T: SE2, cov: tuple[float, ...]) -> bool:
-    """Whether a pose is within LARGEST_M and its covariance symmetric and positive semidefinite."""
-    if not (abs(T.x_m) <= LARGEST_M and abs(T.y_m) <= LARGEST_M and abs(T.yaw_rad) <= LARGEST_M):
+    """Whether a pose is within MAX_M and its covariance symmetric and positive semidefinite."""
+    if not (abs(T.x_m) <= MAX_M and abs(T.y_m) <= MAX_M and abs(T.yaw_rad) <= MAX_M):
         return False
     xx, xy, xt, yx, yy, yt, tx, ty, tt = cov
-    if xy == yx and xt == tx and yt == ty and 0.0 < xx <= LARGEST_M and 0.0 < yy <= LARGEST_M and 0.0 < tt <= LARGEST_M:
+    if xy == yx and xt == tx and yt == ty and 0.0 < xx <= MAX_M and 0.0 < yy <= MAX_M and 0.0 < tt <= MAX_M:
         det = xx * yy - xy * xy  # Sylvester: all leading minors are positive
         if det > 0.0 and tt * det > xx * yt * yt - 2.0 * xy * xt * yt + yy * xt * xt:
             return True
-    if max(map(abs, cov)) > LARGEST_M:
+    if max(map(abs, cov)) > MAX_M:
         return False
     P = np.reshape(cov, (3, 3))
     return bool(np.linalg.eigvalsh(0.5 * (P + P.T))[0] >= -_MIN_COV)

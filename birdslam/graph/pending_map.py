@@ -13,7 +13,7 @@ from birdslam.types import LanePoint, MapUpdate
 
 
 class PendingState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """All that `PendingMap` holds; see there."""
+    """The state of `PendingMap`."""
 
     frame_id: int
     landmarks: list[tuple[float, float]]
@@ -21,9 +21,9 @@ class PendingState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
 
 class PendingMap:
-    """Of one epoch. The oldest go past `landmarks` points or `frames` of lanes.
+    """The new map points of one epoch. The oldest are dropped beyond `landmarks` points or `frames` frames of lanes.
 
-    Lane points are turned into world only when they are asked for.
+    `take` transforms lane points to world.
     """
 
     def __init__(self, landmarks: int, frames: int) -> None:
@@ -31,17 +31,17 @@ class PendingMap:
         self.begin(0)
 
     def begin(self, epoch: int) -> None:
-        """Nothing of `epoch` yet."""
+        """Clears the points for a new epoch."""
         self._epoch, self._frame_id = epoch, 0
         self._landmarks: deque[tuple[float, float]] = deque(maxlen=self._capacity[0])
         self._lanes: deque[tuple[SE2, tuple[LanePoint, ...]]] = deque(maxlen=self._capacity[1])
 
     def state(self) -> PendingState:
-        """For `resume`."""
+        """The state for `resume`."""
         return PendingState(frame_id=self._frame_id, landmarks=list(self._landmarks), lanes=list(self._lanes))
 
     def resume(self, state: PendingState, epoch: int) -> None:
-        """Goes on where the map of this state was."""
+        """Restores the state."""
         self.begin(epoch)
         self._frame_id = state.frame_id
         self._landmarks.extend(state.landmarks)
@@ -50,14 +50,14 @@ class PendingMap:
     def add(
         self, frame_id: int, landmarks_m: Sequence[tuple[float, float]], T_world_ego: SE2, lanes: tuple[LanePoint, ...]
     ) -> None:
-        """`landmarks_m` in world, `lanes` in ego."""
+        """Adds `landmarks_m` in world and `lanes` in ego."""
         self._frame_id = frame_id
         self._landmarks.extend(landmarks_m)
         if lanes:
             self._lanes.append((T_world_ego, lanes))
 
     def take(self) -> MapUpdate | None:
-        """All of it, which is then no longer pending; None where it is nothing."""
+        """Returns and removes all points; None if there are none."""
         if not self._landmarks and not self._lanes:
             return None
         lanes_m = [

@@ -31,7 +31,7 @@ from birdslam.graph.marginals import vehicle_estimates
 from birdslam.graph.minimum import minimise, solver
 from birdslam.graph.pending_map import PendingMap
 from birdslam.graph.state_layout import POSE
-from birdslam.graph.vehicles import SHORTEST_S, VehicleNodes, cv_edges
+from birdslam.graph.vehicles import MIN_INTERVAL_S, VehicleNodes, cv_edges
 from birdslam.graph.weights import WeightsConfig, weighted
 from birdslam.graph.window import Window
 from birdslam.lanes.occupancy import with_users
@@ -284,7 +284,7 @@ class PoseGraph:
             return self._estimate(m, (*m.status, Status.NOT_INITIALISED), np.zeros((3, 3)), ())
         m = msgspec.structs.replace(m, speed_sources=m.speed_sources or (SpeedSource.CARRIED,))
         since_s = max((m.t_source_ns - self._t_ns) * 1e-9, 0.0)
-        twist = self._motion.log() / max((self._t_ns - self._t_before_ns) * 1e-9, SHORTEST_S)
+        twist = self._motion.log() / max((self._t_ns - self._t_before_ns) * 1e-9, MIN_INTERVAL_S)
         change = np.array([config.blind_mps, config.blind_mps, config.blind_radps])
         way = SE2()
         if Status.COASTING in m.status:
@@ -300,11 +300,11 @@ class PoseGraph:
     def _ego_mps(self) -> complex:
         """The ego's velocity in its own axes, from the last motion."""
         since_s = (self._t_ns - self._t_before_ns) * 1e-9
-        return complex(self._motion.x_m, self._motion.y_m) / max(since_s, SHORTEST_S)
+        return complex(self._motion.x_m, self._motion.y_m) / max(since_s, MIN_INTERVAL_S)
 
     def _lanes(self, lanes: Lanes, window: Window, vehicles: tuple[VehicleEstimate, ...]) -> Lanes:
         """Returns the lanes of the front end with the road users in them."""
-        passed_s = max((self._t_ns - self._t_before_ns) * 1e-9, SHORTEST_S)
+        passed_s = max((self._t_ns - self._t_before_ns) * 1e-9, MIN_INTERVAL_S)
         users = lane_users(window, self._vehicles.nodes, vehicles, self._people)
         return with_users(lanes, users, self._motion.x_m / passed_s, self._traffic)
 

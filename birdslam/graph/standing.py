@@ -17,7 +17,7 @@ from birdslam.graph.vehicles import VehicleNode
 from birdslam.types import Moves
 
 PRIOR = 1.0 / 3.0  # probability that a new vehicle is stationary, as in parallax.py
-PRIOR_BESIDE = 0.75  # the same for vehicles first seen more than 15 m aside: 48 of 62 labelled cars of KITTI tracking
+PRIOR_BESIDE = 0.75  # the same for vehicles first seen more than 15 m aside, from labels of KITTI tracking
 MAX_PROBABILITY = 0.99  # limit of either probability, and 1 minus it
 DECIDED, GIVEN_UP = 0.9, 0.7  # probabilities at which a decision is made, and revoked; by judgement
 STANDING_MPS = 0.05  # 1-sigma of the velocity of a stationary vehicle

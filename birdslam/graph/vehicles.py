@@ -17,7 +17,7 @@ from birdslam.types import Moves, VehicleEdge
 PATH_HALF_WIDTH_M = 1.75  # half a lane, as in vehicles/state/parallax.py
 BESIDE_M = 15.0  # vehicles at a larger lateral distance are on another road or parked: standing.py
 MAX_LOG_HEIGHT = 2.0  # of a vehicle
-SHORTEST_S = 1e-3  # minimum interval, for source clocks that stop or step back
+MIN_INTERVAL_S = 1e-3  # for source clocks that stop or step back
 
 
 @dataclass(slots=True)
@@ -102,7 +102,7 @@ class VehicleNodes:
         dt_s = np.zeros(len(self.nodes))
         for row in reached:
             v = self.nodes[row]
-            dt_s[row] = max((t_ns - v.node_ns) * 1e-9, SHORTEST_S)
+            dt_s[row] = max((t_ns - v.node_ns) * 1e-9, MIN_INTERVAL_S)
             v.node_frame, v.node_ns = frame, t_ns
         cv, vv = NO_CV, NO_VV
         if known:

@@ -29,6 +29,6 @@ def sigma_of(family: Family) -> EdgeSigma | None:
         return None
     if family != "unknown" and family not in FAMILIES:
         raise ValueError(
-            f"no family of detectors {family!r}; there are {', '.join((*FAMILIES, 'unknown', 'configured'))}"
+            f"unknown detector family {family!r}; expected one of {', '.join((*FAMILIES, 'unknown', 'configured'))}"
         )
     return FAMILIES.get(family, UNKNOWN)

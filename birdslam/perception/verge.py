@@ -17,7 +17,7 @@ SHRINK = 4  # downscaling suppresses single blades and noise
 # Min. excess of grass over the road's level
 MIN_EXCESS = 0.06
 ROAD_SHARE = 0.3  # the road's level is this quantile of the mask, up to 70 % of which may be grass
-DARKEST = 60.0  # of R + G + B: darker pixels have no reliable colour
+MIN_BRIGHTNESS = 60.0  # of R + G + B: darker pixels have no reliable colour
 MIN_PIXELS = 50  # of a downscaled mask, for the level
 
 
@@ -34,7 +34,7 @@ def without_verge(road: Bools, image: NDArray[np.uint8]) -> Bools:
     blue, green, red = (plane.astype(np.float32) for plane in cv2.split(small))
     sums = blue + green + red
     excess = 3.0 * green / np.maximum(sums, 1.0) - 1.0  # 2 g - r - b, since r + g + b = 1
-    coloured = road[part][SHRINK // 2 :: SHRINK, SHRINK // 2 :: SHRINK] & (sums > DARKEST)
+    coloured = road[part][SHRINK // 2 :: SHRINK, SHRINK // 2 :: SHRINK] & (sums > MIN_BRIGHTNESS)
     excess_road = excess[coloured]
     if len(excess_road) < MIN_PIXELS:
         return road

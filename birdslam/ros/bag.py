@@ -51,8 +51,8 @@ class Bag:
         try:
             reader = AnyReader([path], default_typestore=_types_of_humble())
             self._reader = self._stack.enter_context(reader)
-        except Exception as error:  # a torn file raises whatever its storage, its YAML or its compression does
-            raise BagError(f"{path}: is no ROS bag that can be read: {_reason(error)}") from None
+        except Exception as error:  # storages, YAML and compression raise many types for a damaged file
+            raise BagError(f"{path}: is not a readable ROS bag: {_reason(error)}") from None
         self.types: dict[str, str] = {}  # topic -> message type, as in "sensor_msgs/Image"
         self.counts: dict[str, int] = {}  # topic -> messages
         for connection in sorted(self._reader.connections, key=lambda one: one.topic):
@@ -96,7 +96,7 @@ class Bag:
             except StopIteration:
                 return
             except Exception as error:  # as in __init__
-                raise BagError(f"{self.path}: can't be read on: {_reason(error)}") from None
+                raise BagError(f"{self.path}: can't be read further: {_reason(error)}") from None
             yield BagMessage(connection.topic, t_ns, content)
 
 

@@ -26,14 +26,14 @@ class BagWriter:
         except ImportError:
             raise BagError(f"{directory}: {NEEDS_EXTRA}") from None
         if directory.exists():
-            raise BagError(f"{directory}: is there already")
+            raise BagError(f"{directory}: exists already; name a new directory")
         self.directory = directory
         self._partial = directory.with_name(f".{directory.name}.partial")
         self._types = MessageTypes()
         self.make = self._types.make
         self._connections: dict[str, Any] = {}
         try:
-            if self._partial.exists():  # of an export that was killed
+            if self._partial.exists():  # left by a killed export
                 shutil.rmtree(self._partial)
             writer = Writer(self._partial / directory.name, version=8, storage_plugin=StoragePlugin[storage.upper()])
             self._writer = writer.__enter__()

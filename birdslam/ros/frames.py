@@ -26,7 +26,7 @@ class StaticFrames:
 
     @classmethod
     def of(cls, messages: Iterable[Any]) -> StaticFrames:
-        """Of tf2_msgs/TFMessage."""
+        """The frames of tf2_msgs/TFMessage."""
         found = cls.__new__(cls)
         found._add(messages)
         return found
@@ -54,7 +54,7 @@ class StaticFrames:
         out = {frame: T_ancestor_frame}
         while frame in self._from_parent:
             frame, T_parent_child = self._from_parent[frame]
-            if frame in out:  # a circle
+            if frame in out:  # a cycle
                 break
             T_ancestor_frame = T_parent_child @ T_ancestor_frame
             out[frame] = T_ancestor_frame
@@ -70,13 +70,13 @@ class StaticFrames:
         if T_base_cam is None:
             return None
         height_m = float(T_base_cam[2, 3])
-        level = T_base_cam @ inverse(mount_pose(GroundPlane(1.0)))  # what is left is yaw, pitch, roll and the place
+        level = T_base_cam @ inverse(mount_pose(GroundPlane(1.0)))  # the rest is yaw, pitch, roll and the position
         _, attitude = split_pose(level)
         pitch_rad, roll_rad = attitude.pitch_rad, attitude.roll_rad
         if not 0.2 < height_m < 5.0 or abs(pitch_rad) > 0.5 or abs(roll_rad) > 0.5:
             raise ValueError(
                 f"{TF_STATIC} puts {camera} {height_m:.2f} m over {base}, {np.degrees(pitch_rad):.0f} degrees nose "
-                f"down and {np.degrees(roll_rad):.0f} right side down: no optical frame (REP-103) of a camera on a car"
+                f"down and {np.degrees(roll_rad):.0f} right side down, which is not an optical frame (REP-103) on a car"
             )
         return GroundPlane(height_m, pitch_rad, roll_rad)
 
@@ -85,7 +85,7 @@ def _matrix(transform: Any) -> Transform:
     t, q = transform.translation, transform.rotation
     out = np.eye(4)
     if not np.isfinite([t.x, t.y, t.z, q.x, q.y, q.z, q.w]).all() or not any((q.x, q.y, q.z, q.w)):
-        out[:] = np.nan  # no rotation: `mount` refuses what rests on it
+        out[:] = np.nan  # not a rotation: `mount` rejects it
         return out
     out[:3, :3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
     out[:3, 3] = t.x, t.y, t.z

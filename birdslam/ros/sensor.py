@@ -21,7 +21,7 @@ CAMERA_INFO = "sensor_msgs/CameraInfo"
 FIX = "sensor_msgs/NavSatFix"
 SPEEDS = ("geometry_msgs/TwistStamped", "geometry_msgs/TwistWithCovarianceStamped", "nav_msgs/Odometry")
 
-# ROS encoding -> bytes a pixel, and what OpenCV does to it
+# ROS encoding -> bytes per pixel, OpenCV's conversion
 ENCODINGS: dict[str, tuple[int, int | None]] = {
     "mono8": (1, None),
     "8UC1": (1, None),
@@ -58,38 +58,38 @@ class Lens(NamedTuple):
 def pixels(image: Any) -> NDArray[np.uint8]:
     """(H, W) grey or (H, W, 3) BGR of a sensor_msgs/Image. Raises ValueError with the reason."""
     if image.encoding not in ENCODINGS:
-        raise ValueError(f"encoding {image.encoding!r} is none of {', '.join(ENCODINGS)}")
+        raise ValueError(f"encoding {image.encoding!r} is not one of {', '.join(ENCODINGS)}")
     channels, conversion = ENCODINGS[image.encoding]
     height_px, width_px, row = int(image.height), int(image.width), int(image.step)
     data = np.frombuffer(memoryview(image.data), np.uint8)
     if not (width_px > 0 and height_px > 0 and row >= width_px * channels and data.size >= height_px * row):
         raise ValueError(
-            f"{data.size} bytes in rows of {row} are no image of {width_px}x{height_px} in {image.encoding}"
+            f"{data.size} bytes in rows of {row} are not an image of {width_px}x{height_px} in {image.encoding}"
         )
     rows = data[: height_px * row].reshape(height_px, row)[:, : width_px * channels]
     shape = (height_px, width_px) if channels == 1 else (height_px, width_px, channels)
     out = np.ascontiguousarray(rows).reshape(shape)
     try:
         return out if conversion is None else cv2.cvtColor(out, conversion)  # type: ignore[return-value]
-    except cv2.error:  # a mosaic or a pair of pixels that the size has no room for
-        raise ValueError(f"{width_px}x{height_px} is no size of an image in {image.encoding}") from None
+    except cv2.error:  # too small for a Bayer mosaic or for pairs of pixels
+        raise ValueError(f"{width_px}x{height_px} is not a valid image size in {image.encoding}") from None
 
 
 def lens(info: Any, rectified: bool) -> Lens:
-    """Of a sensor_msgs/CameraInfo: of the raw image (K, D), or of the rectified one (P). Raises ValueError.
+    """The lens in a sensor_msgs/CameraInfo: of the raw image (K, D), or of the rectified one (P). Raises ValueError.
 
-    CameraInfo is of the full sensor: binning and region of interest say which part of it the image is.
+    CameraInfo refers to the full sensor; binning and region of interest define the image.
     """
     P, K, D = (np.array(_field(info, name), dtype=np.float64) for name in ("p", "k", "d"))
     fx, fy, cx, cy = (P[0], P[5], P[2], P[6]) if rectified else (K[0], K[4], K[2], K[5])
     if not (fx > 0.0 and fy > 0.0):
-        raise ValueError("holds no calibration: its focal lengths are zero")
+        raise ValueError("has no calibration: its focal lengths are zero")
     model, binning = str(info.distortion_model), (max(int(info.binning_x), 1), max(int(info.binning_y), 1))
     fisheye = model == "equidistant" and not rectified
     distortion: tuple[float, ...] = ()
     if not rectified and (D.any() or fisheye):
         if model not in MODELS:
-            raise ValueError(f"distortion_model {model!r} is none of {', '.join(MODELS)}")
+            raise ValueError(f"distortion_model {model!r} is not one of {', '.join(MODELS)}")
         if len(D) not in MODELS[model]:
             raise ValueError(f"distortion_model {model!r} with {len(D)} coefficients")
         distortion = tuple(D.tolist())
@@ -110,12 +110,12 @@ def lens(info: Any, rectified: bool) -> Lens:
 
 
 def is_rectified(topic: str) -> bool:
-    """By image_proc's names: the images of `image_rect`, `image_rect_color` are rectified."""
+    """Whether the images are rectified, by image_proc's names `image_rect` and `image_rect_color`."""
     return any(part.startswith("image_rect") for part in topic.split("/"))
 
 
 def speed(message: Any, t_ns: int, sigma_mps: float, yaw_rate_sigma_radps: float, has_yaw_rate: bool) -> SpeedReading:
-    """Of a message of one of SPEEDS. The sigmas hold where it has no covariance.
+    """The reading in a message of one of SPEEDS. The sigmas apply to a message without covariance.
 
     The yaw rate is None unless `has_yaw_rate`.
     """
@@ -133,7 +133,7 @@ def speed(message: Any, t_ns: int, sigma_mps: float, yaw_rate_sigma_radps: float
 
 
 def fix_row(message: Any, t_ns: int) -> str | None:
-    """A sensor_msgs/NavSatFix as a line of loops/gnss_file.py (time, degrees, sigma); None where there is no fix."""
+    """A sensor_msgs/NavSatFix as a line of loops/gnss_file.py (time, degrees, sigma); None without a fix."""
     if message.status.status < 0 or not (math.isfinite(message.latitude) and math.isfinite(message.longitude)):
         return None
     sigma_m = _sigma(message.position_covariance, 0, FIX_SIGMA_M)

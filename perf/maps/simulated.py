@@ -29,7 +29,6 @@ from birdslam.runtime.maps.drive_earth import write_earth
 from birdslam.types import NS_PER_S, Attitude
 
 LENGTHS_KM = 1, 10, 100
-COMPARED_KM = 10  # max. length for the comparison with other indices
 LOOK_UPS = 20
 ORIGIN, FIX_M = (51.05, -114.05), 2.5
 LEG_M, CORNER_M = 400, 19  # winding street of equal houses: straight legs, and corners of 12 m radius

@@ -14,7 +14,7 @@ from birdslam.types import Approach
 
 HORIZON_S = 30.0  # a later approach is evaluated at this time
 NEARBY_S, NEARBY_M, NEARBY_SIGMA = 5.0, 2.0, 2.0
-SLOWEST_MPS2 = 0.01  # minimum of the squared relative velocity
+MIN_SPEED2_MPS2 = 0.01  # minimum of the squared relative velocity
 MAX_REPORTED = 1e9  # limit of every reported number
 
 
@@ -28,7 +28,7 @@ def approaches(p: Complexes, v: Complexes, covs: Floats) -> list[Approach]:
     numbers = np.empty((4, len(p)))  # of each approach
     time, sigma_s, distance, sigma_m = numbers
     back = v.conj()
-    square = np.maximum((v * back).real, SLOWEST_MPS2)
+    square = np.maximum((v * back).real, MIN_SPEED2_MPS2)
     free = (p * back).real / -square
     np.minimum(np.maximum(free, 0.0), HORIZON_S, out=time)
     at = p + v * time

@@ -23,8 +23,8 @@ MAX_PEOPLE = 60  # the nearest ones; bounds the size of a message and the time o
 YAW_UNKNOWN = math.pi**2 / 3.0  # variance of a uniform direction
 CHANGE_MPS = 0.8  # 1-sigma by which a velocity changes within a second, as in `people_config.Sizes`
 TURNS_MPS = 0.5  # minimum speed for a yaw
-MAX_DISTANCE_M, FASTEST_MPS = 1e4, 1e3  # beyond them the record is corrupt
-_LIMITS = np.repeat([MAX_DISTANCE_M, FASTEST_MPS, MAX_DISTANCE_M**2, FASTEST_MPS**2], [2, 2, 4, 4])
+MAX_DISTANCE_M, MAX_SPEED_MPS = 1e4, 1e3  # beyond them the record is corrupt
+_LIMITS = np.repeat([MAX_DISTANCE_M, MAX_SPEED_MPS, MAX_DISTANCE_M**2, MAX_SPEED_MPS**2], [2, 2, 4, 4])
 
 
 def people_estimates(

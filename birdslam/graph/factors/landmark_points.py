@@ -16,7 +16,7 @@ import numpy as np
 
 from birdslam.geometry.arrays import Complexes, Floats, Ints
 from birdslam.graph.costs import inflation, point_costs
-from birdslam.graph.edges import LARGEST_M
+from birdslam.graph.edges import MAX_M
 from birdslam.graph.factors.factor import Factor, GraphFrame, Linearised
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.window import EGO_PLACE, KEY_PLACE, Window
@@ -58,8 +58,8 @@ def sightings(edges: tuple[LandmarkEdge, ...]) -> Sightings:
     keys = list(latest)
     parts = [part for e in latest.values() for part in ((e.x_m, e.y_m), e.cov, e.shared or _NOTHING)]
     table = np.fromiter(chain.from_iterable(parts), np.float64, 10 * len(keys)).reshape(-1, 10)
-    if np.abs(table).max(initial=0.0) > LARGEST_M:
-        sane = np.abs(table).max(axis=1) <= LARGEST_M
+    if np.abs(table).max(initial=0.0) > MAX_M:
+        sane = np.abs(table).max(axis=1) <= MAX_M
         keys, table = [key for key, keep in zip(keys, sane.tolist(), strict=True) if keep], table[sane]
     x, y, xx, xy, _, yy = table.T[:6]
     shared = table.T[6:8] + 1j * table.T[8:]

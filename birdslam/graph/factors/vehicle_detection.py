@@ -11,7 +11,7 @@ from birdslam.graph.factors.factor import Factor, GraphFrame, Linearised
 from birdslam.graph.factors.lasting_error import DRIVING_MPS, kept, relative_sigmas
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.state_layout import LASTING, OF_VEHICLE, POSE
-from birdslam.graph.vehicles import SHORTEST_S
+from birdslam.graph.vehicles import MIN_INTERVAL_S
 from birdslam.graph.window import PLACE, Window
 
 OWN_POSE = [*range(POSE.start, POSE.stop)]
@@ -37,7 +37,7 @@ class VehicleDetections(Factor):
         edges = frame.associations.cv
         if self._share and edges.rows:
             sigma_rel = relative_sigmas(edges)
-            ego_mps = math.hypot(frame.motion.x_m, frame.motion.y_m) / max(frame.passed_s, SHORTEST_S)
+            ego_mps = math.hypot(frame.motion.x_m, frame.motion.y_m) / max(frame.passed_s, MIN_INTERVAL_S)
             driven_s = frame.associations.dt_s[edges.rows] * -math.expm1(-ego_mps / DRIVING_MPS)
             same = kept(sigma_rel, window.sigma_rel[edges.rows], driven_s, self._memory_s)
             window.fade_lasting(edges.rows, same, sigma_rel)
