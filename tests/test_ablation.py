@@ -37,7 +37,7 @@ def grows(less: Floats, more: Floats) -> float:
 
 @of_both_graphs
 @pytest.mark.parametrize("edge", ["cc", "cp", "cv", "vv"])
-def test_without_an_edge_what_it_ties_is_known_less_well(base: Live, edge: str) -> None:
+def test_removing_an_edge_increases_the_covariance(base: Live, edge: str) -> None:
     (ego, vehicles), (ego_all, vehicles_all) = (
         known(ablation.constraint_variants(base)[name]) for name in (f"without_{edge}", "all")
     )
@@ -46,7 +46,7 @@ def test_without_an_edge_what_it_ties_is_known_less_well(base: Live, edge: str) 
 
 
 @of_both_graphs
-def test_landmarks_say_more_by_weight_and_by_depth(base: Live) -> None:
+def test_information_of_landmarks_follows_weight_and_depth(base: Live) -> None:
     variants = ablation.landmark_variants(base)
     for names in (ablation.CP_WEIGHTS, ablation.DEPTHS_M):
         egos = [known(variants[name])[0] for name in names]

@@ -29,7 +29,7 @@ FRAMES = 12
 
 
 @pytest.mark.processes
-def test_importing_birdslam_loads_nothing_until_a_name_is_asked_for() -> None:
+def test_import_is_lazy() -> None:
     code = (
         "import sys, birdslam; assert not {'numpy', 'cv2', 'onnxruntime', 'msgspec'} & set(sys.modules); "
         "from birdslam import BirdSLAM, Camera, SlamConfig, Estimate; assert 'numpy' in sys.modules; "
@@ -38,7 +38,7 @@ def test_importing_birdslam_loads_nothing_until_a_name_is_asked_for() -> None:
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_every_public_name_is_there_with_a_docstring_and_known_to_editors() -> None:
+def test_every_public_name_has_a_docstring_and_is_known_to_editors() -> None:
     for name in birdslam.__all__:
         assert (getattr(birdslam, name).__doc__ or "").strip(), name
     assert set(birdslam.__all__) <= set(dir(birdslam))
@@ -73,7 +73,7 @@ def records(slam: birdslam.BirdSLAM, frames: Iterator[Frame]) -> list[tuple[Meas
     return [slam.step(frame) for frame in frames]
 
 
-def test_with_shipped_networks_is_what_evaluate_runs() -> None:
+def test_with_shipped_networks_equals_evaluate() -> None:
     recording = Beginning(open_recording("demo"))
     own = records(
         birdslam.BirdSLAM.with_shipped_networks(recording.camera, recording.rate_hz), recording.undistorted_frames()
@@ -87,7 +87,7 @@ def test_with_shipped_networks_is_what_evaluate_runs() -> None:
     assert any(estimate.vehicles for _, estimate in own) or any(measured.cc for measured, _ in own)
 
 
-def test_an_unreadable_frame_says_so() -> None:
+def test_unreadable_frame_has_a_status() -> None:
     class Torn(Beginning):
         def frames(self, start: int = 0) -> Iterator[RecordedFrame]:
             first, second, third = (frame for frame in super().frames(start) if frame.index < 3)

@@ -85,14 +85,14 @@ def test_every_package_has_its_row() -> None:
     assert {package_of(module) for module in HOUSE} - set(TABLE) == set()
 
 
-def test_a_package_imports_what_the_table_says_and_nothing_else() -> None:
+def test_package_imports_follow_the_table() -> None:
     for module in HOUSE:
         own = package_of(module)
         others = {package_of(name) for name in inside(module)} - {own} - TABLE.get(own, set())
         assert not others, f"{module} imports of {', '.join(sorted(others))}"
 
 
-def test_the_table_names_what_there_is_and_nothing_that_is_not_used() -> None:
+def test_table_lists_exactly_the_used_imports() -> None:
     used: dict[str, set[str]] = {package_of(module): set() for module in HOUSE}
     for module in HOUSE:
         used[package_of(module)] |= {package_of(name) for name in inside(module)} - {package_of(module)}
@@ -102,7 +102,7 @@ def test_the_table_names_what_there_is_and_nothing_that_is_not_used() -> None:
 
 
 @pytest.mark.parametrize("graph", ["packages", "modules"])
-def test_there_is_no_circle(graph: str) -> None:
+def test_imports_have_no_cycle(graph: str) -> None:
     of = {module: inside(module) for module in HOUSE} if graph == "modules" else TABLE
     try:
         TopologicalSorter(of).prepare()
@@ -212,10 +212,10 @@ PATCHES = {"setattr", "getattr", "hasattr", "delattr", "patch", "object"}
         ("a._replace(b=1).__dict__", 0),
     ],
 )
-def test_a_private_touch_is_found(text: str, line: int) -> None:
+def test_private_access_is_found(text: str, line: int) -> None:
     assert [*private_touches(text)] == ([line] if line else [])
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "tests").rglob("*.py")), ids=lambda path: path.stem)
-def test_a_test_touches_nothing_private_without_a_reason(path: Path) -> None:
+def test_tests_access_private_names_only_with_a_reason(path: Path) -> None:
     assert private_touches(path.read_text()) == {}

@@ -73,7 +73,7 @@ def test_nothing_is_known_before_the_first_frame() -> None:
     assert atlas.map() is None
 
 
-def test_key_poses_lie_apart_and_the_newest_is_always_there() -> None:
+def test_key_poses_are_spaced_and_include_the_newest() -> None:
     atlas = Atlas(AtlasConfig(key_pose_m=0.5, key_pose_rad=0.1))
     for frame in range(101):
         atlas.add(at(frame, SE2(0.1 * frame)))
@@ -119,7 +119,7 @@ def test_memory_is_bounded_by_a_coarse_past() -> None:
     assert max(x for x, _ in lanes.lanes_m) == 0.5 * 3999
 
 
-def test_the_last_seconds_alone() -> None:
+def test_only_the_last_seconds() -> None:
     atlas = Atlas(AtlasConfig())
     for frame in range(100):
         atlas.add(at(frame, SE2(float(frame)), car(5, SE2(float(frame), 4.0)), *([car(1, SE2())] * (frame < 50))))
@@ -129,7 +129,7 @@ def test_the_last_seconds_alone() -> None:
     assert [(path.vehicle, path.poses[0].frame_id) for path in way.vehicles] == [(5, 79)]
 
 
-def test_vehicles_and_their_paths_are_bounded_the_freshest_stay() -> None:
+def test_vehicles_and_paths_are_bounded_to_the_most_recent() -> None:
     atlas = Atlas(SMALL)
     for frame in range(60):
         seen = [car(k, SE2(float(frame), float(k))) for k in range(6) if k >= 3 or frame < 30]
@@ -141,7 +141,7 @@ def test_vehicles_and_their_paths_are_bounded_the_freshest_stay() -> None:
     assert all(path.poses[-1].frame_id == 59 for path in way.vehicles)
 
 
-def test_epochs_do_not_mix_and_the_oldest_go() -> None:
+def test_epochs_are_separate_and_the_oldest_are_dropped() -> None:
     atlas = Atlas(replace(SMALL, epochs=2))
     for epoch in range(4):
         gained = MapUpdate(epoch=epoch, frame_id=epoch, landmarks_m=((float(epoch), 0.0),))
@@ -157,7 +157,7 @@ def test_epochs_do_not_mix_and_the_oldest_go() -> None:
     assert atlas.trajectory() == atlas.trajectory(epoch=3)
 
 
-def test_by_default_the_epoch_before_is_kept_for_its_last_map_updates_and_none_more() -> None:
+def test_previous_epoch_is_kept_for_its_last_map_updates() -> None:
     atlas = Atlas(AtlasConfig())
     for epoch in range(3):
         atlas.add(at(epoch, SE2(), epoch=epoch))
@@ -230,7 +230,7 @@ def test_lane_points_keep_the_newest_id_of_their_cell() -> None:
     }
 
 
-def test_a_map_without_lanes_that_have_ids_says_none() -> None:
+def test_map_without_lane_ids_has_none() -> None:
     atlas = Atlas(SMALL)
     atlas.add(at(0, SE2()), MapUpdate(epoch=0, frame_id=0, lanes_m=((0.0, 0.0),)))
     chart = atlas.map()

@@ -125,13 +125,13 @@ def test_many_drives_take_little_memory_each(tmp_path: Path) -> None:
     assert len({id(task.configuration) for task in many}) == 2
 
 
-def test_drives_of_one_name_have_folders_of_their_own(tmp_path: Path) -> None:
+def test_drives_of_one_name_have_separate_folders(tmp_path: Path) -> None:
     names = [task.name for task in made([kitti(tmp_path / "a" / "00", 1), kitti(tmp_path / "b" / "00", 1)])]
     assert len(set(names)) == 2
     assert all(name.startswith("00-") for name in names)
 
 
-def test_results_appear_whole_and_are_the_same_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_results_are_atomic_and_deterministic(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (task,) = made([kitti(tmp_path / "sequences" / "00", truth=True)])
     frames = []
     for output in ("once", "again"):
@@ -229,9 +229,7 @@ def test_a_failed_drive_is_isolated_and_retried(tmp_path: Path, capsys: pytest.C
 
 
 @pytest.mark.processes
-def test_a_process_that_is_killed_is_a_failure_of_its_drive_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_killed_process_fails_only_its_drive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The first drive's process kills itself, as the kernel does where memory is short."""
     two = made([kitti(tmp_path / "00"), kitti(tmp_path / "01")])
     start = subprocess.Popen

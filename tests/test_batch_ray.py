@@ -1,4 +1,4 @@
-"""A batch on a real Ray cluster of two nodes, one of which is lost in the middle; and drives that lie elsewhere."""
+"""A batch on a real Ray cluster of two nodes, one of which is lost; and remote drives."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.test_batch import contents, kitti, made
 DRIVES_OF_ALL, FRAMES = 6, 150
 
 
-def test_a_drive_is_fetched_for_as_long_as_it_is_read(tmp_path: Path) -> None:
+def test_drive_is_fetched_while_it_is_read(tmp_path: Path) -> None:
     fsspec = pytest.importorskip("fsspec")
     with fsspec.filesystem("memory").open("/store/drive.mp4", "wb") as file:
         file.write(b"film")
@@ -64,7 +64,7 @@ def test_without_ray_the_extra_is_named(
 @pytest.mark.slow
 @pytest.mark.processes
 @pytest.mark.filterwarnings("ignore")  # Ray's own
-def test_a_node_that_is_lost_loses_no_drive_and_doubles_none(tmp_path: Path) -> None:
+def test_lost_node_neither_loses_nor_duplicates_drives(tmp_path: Path) -> None:
     pytest.importorskip("ray")
     from ray.cluster_utils import Cluster
 

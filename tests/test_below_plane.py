@@ -33,13 +33,13 @@ def _updated(window: SlidingWindow) -> BelowPlaneFilter:
 
 
 @pytest.mark.parametrize("ratio", [0.3, 1.0, 1.6])
-def test_what_stands_on_the_road_or_before_it_is_kept(ratio: float) -> None:
+def test_features_on_the_road_or_nearer_are_kept(ratio: float) -> None:
     window = _window(ROWS_PX, ratio)
     assert _updated(window).inliers(window.ids).all()
     assert np.isfinite(window.rho).all()
 
 
-def test_what_seems_to_lie_behind_the_road_leaves_the_window_and_stays_out_while_it_is_followed() -> None:
+def test_features_behind_the_road_are_rejected_for_their_whole_track() -> None:
     window = _window(ROWS_PX, 4.0)
     below_plane = _updated(window)
     assert np.isnan(window.rho).all()
@@ -47,7 +47,7 @@ def test_what_seems_to_lie_behind_the_road_leaves_the_window_and_stays_out_while
     assert below_plane.inliers(np.array([0, 2])).tolist() == [True, False]  # 0 was lost: an id never comes again
 
 
-def test_an_uncertain_depth_is_no_evidence() -> None:
+def test_uncertain_depth_is_not_evidence() -> None:
     window = _window(ROWS_PX, 4.0, sigma_rel=0.5)
     assert _updated(window).inliers(window.ids).all()
 
@@ -57,13 +57,13 @@ def test_above_the_horizon_and_far_ahead_everything_is_kept() -> None:
     assert _updated(window).inliers(window.ids).all()
 
 
-def test_landmarks_of_unknown_depth_are_not_judged() -> None:
+def test_landmarks_of_unknown_depth_are_not_tested() -> None:
     window = _window(ROWS_PX, 4.0)
     window.rho[:] = np.nan
     assert _updated(window).inliers(window.ids).all()
 
 
-def test_by_night_a_box_ends_past_the_glow_of_its_lamps() -> None:
+def test_box_includes_the_glow_of_lamps_at_night() -> None:
     box, beside = np.array([[100.0, 100.0, 140.0, 130.0]]), np.array([[146.0, 115.0], [150.0, 115.0]])
     assert outside(beside, box).tolist() == [True, True]
     assert outside(beside, box, night=True).tolist() == [False, True]

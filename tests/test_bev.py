@@ -27,7 +27,7 @@ def test_back_projection_undoes_projection(ground: GroundPlane, x_m: float, slop
 
 
 @given(grounds, st.floats(3.0, 40.0), st.floats(-1.0, 1.0), st.floats(-1e-3, 3e-3))
-def test_back_projection_meets_a_road_that_bends_upwards_or_downwards(
+def test_back_projection_follows_vertical_curvature(
     ground: GroundPlane, x_m: float, side: float, vertical_per_m: float
 ) -> None:
     """Up to the crest of a falling road, which hides the road beyond."""
@@ -41,7 +41,7 @@ def test_back_projection_meets_a_road_that_bends_upwards_or_downwards(
     assert bev.RoadProfile(ground.height_m, vertical_per_m).slope(x_m) == pytest.approx(slope, abs=1e-9)
 
 
-def test_equation_1_as_the_paper_writes_it() -> None:
+def test_equation_1_as_in_the_paper() -> None:
     """On level ground the normal is [0, -1, 0], and depth is H * fy / (v - cy)."""
     ground = GroundPlane(1.65)
     np.testing.assert_allclose(ground.normal_cam, [0.0, -1.0, 0.0], atol=1e-12)

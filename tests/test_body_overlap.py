@@ -53,7 +53,7 @@ def test_each_box_has_the_body_of_the_box_that_overlaps_it_most() -> None:
     assert with_bodies(theirs, embodied(boxes(LEFT), [9.0])) is theirs  # whose bodies are its own
 
 
-def test_a_box_without_a_body_is_placed_by_its_edges_alone() -> None:
+def test_box_without_body_is_placed_by_its_edges() -> None:
     found = with_bodies(boxes(LEFT, RIGHT), embodied(boxes(SHIFTED_RIGHT), [20.0]))
     seen = observe_boxes(found.boxes_px, found.scores, found.labels, CAMERA, CAMERA.ground, LocalisationConfig(), None)
     measured, places = locate_detected_bodies(seen, found, CAMERA, CAMERA.ground, PseudoLidarConfig())
@@ -69,7 +69,7 @@ def test_a_box_without_a_body_is_placed_by_its_edges_alone() -> None:
 
 
 @pytest.mark.parametrize("others", [None, boxes(LEFT), embodied(boxes(), [])])
-def test_without_bodies_the_detections_stay(others: Detections | None) -> None:
+def test_without_bodies_detections_are_unchanged(others: Detections | None) -> None:
     mine = boxes(LEFT)
     assert with_bodies(mine, others) is mine
     assert len(with_bodies(boxes(), embodied(boxes(LEFT), [9.0]))) == 0

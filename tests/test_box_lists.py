@@ -100,7 +100,7 @@ CORNERS = np.array([[8.0, 8.0, 24.0, 16.0], [40.0, 4.0, 56.0, 12.0]])
 SCORES = np.array([[0.9, 0.1], [0.2, 0.95]])  # the second one is of a class without a label
 
 
-def test_every_way_of_writing_a_box_gives_the_same(tmp_path: Path) -> None:
+def test_all_box_formats_agree(tmp_path: Path) -> None:
     centred = np.hstack([(CORNERS[:, :2] + CORNERS[:, 2:]) / 2.0, CORNERS[:, 2:] - CORNERS[:, :2]])
     shares = (centred / [64.0, 32.0, 64.0, 32.0])[None]
     ways: list[tuple[str, Numbers]] = [
@@ -137,7 +137,7 @@ def test_a_manifest_that_does_not_fit_is_refused(tmp_path: Path, text: str, answ
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from(["none", "sigmoid", "softmax"]))
-def test_numbers_gone_wild_stay_in_bounds(seed: int, scoring: Any) -> None:
+def test_extreme_numbers_stay_in_bounds(seed: int, scoring: Any) -> None:
     rng, (view,) = np.random.default_rng(seed), make_views(640, 320, STRETCH, None)
     rules: Any = {"classes": 2, "labels": {0: "car"}, "score_threshold": 0.1, "nms_iou": 0.5, "scoring": scoring}
     shapes = {"l": (1, 9, 4), "s": (1, 9, 2), "p": (9, 4), "b": (1, 9, 6)}

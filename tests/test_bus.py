@@ -264,7 +264,7 @@ def test_a_record_that_must_arrive_waits_for_a_full_link(join: Any) -> None:
     assert frames.dropped > 0
 
 
-def test_a_lossless_queue_that_overflows_says_so(join: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_overflow_of_a_lossless_queue_is_reported(join: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("birdslam.runtime.transport.bus.LOSSLESS_DEPTH", 4)
     hub = join("supervisor", hub=True, lossless=True)
     frames, tolerant = hub.subscriber("frame"), hub.subscriber("frame", may_drop=True)
@@ -279,7 +279,7 @@ def test_a_lossless_queue_that_overflows_says_so(join: Any, monkeypatch: pytest.
     assert (received(tolerant).record.frame_id, tolerant.dropped) == (5, 5)
 
 
-def test_a_matching_wait_ends_in_time_and_when_somebody_comes(join: Any) -> None:
+def test_matching_wait_ends_at_timeout_or_subscriber(join: Any) -> None:
     hub = join("supervisor", hub=True)
     out = join("capture").publisher("frame")
     assert not out.wait_matched(0.05)
@@ -582,7 +582,7 @@ def test_a_second_instance_is_rejected_while_the_first_runs(base: Path, spawn: A
         pass
 
 
-def test_a_node_that_runs_already_is_named(join: Any, base: Path) -> None:
+def test_running_node_is_named(join: Any, base: Path) -> None:
     join("capture")
     with pytest.raises(BusError, match=r"capture can't join the bus of vehicle 'car' .*capture\.sock"):
         Bus("car", "capture", runtime_dir=base)
@@ -618,7 +618,7 @@ def test_the_default_directory_is_private(base: Path, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("end", ["", "raise KeyboardInterrupt"], ids=["ends", "interrupted"])
-def test_a_process_that_leaves_its_bus_open_ends_in_silence(join: Any, base: Path, end: str) -> None:
+def test_process_with_open_bus_exits_quietly(join: Any, base: Path, end: str) -> None:
     """zenoh's threads never call into an interpreter that has ended, which panics, or is a segmentation fault."""
     join("supervisor", hub=True)
     optimize = join("optimize")

@@ -1,4 +1,4 @@
-"""`birdslam calibrate`: readers of intrinsics, the witnesses of pitch and roll, the height, and every bad input."""
+"""`birdslam calibrate`: readers of intrinsics, estimators of pitch and roll, the height, and invalid input."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_the_same_camera_in_every_yaml(tmp_path: Path, text: str) -> None:
     assert (lens.width_px, lens.height_px) == (640, 480)
 
 
-def test_what_opencv_writes_is_read(tmp_path: Path) -> None:
+def test_opencv_files_are_read(tmp_path: Path) -> None:
     path = tmp_path / "out.yml"
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     storage.write("image_width", 640)
@@ -210,7 +210,7 @@ def test_a_bad_chessboard_is_named(boards: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_stand_by_vehicles_is_within_its_sigma(seed: int) -> None:
+def test_mount_from_vehicles_is_within_its_sigma(seed: int) -> None:
     rng, truth = np.random.default_rng(seed), np.array([1.4, 0.02, -0.01])
     boxes = []
     for vehicle in range(40):
@@ -230,7 +230,7 @@ def test_the_stand_by_vehicles_is_within_its_sigma(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_vehicles_on_a_bank_do_not_pass_for_a_roll_that_is_surely_known(seed: int) -> None:
+def test_vehicles_on_a_slope_do_not_give_a_certain_roll(seed: int) -> None:
     """Those on the right stand 0.04 to 0.1 a metre higher, the farther aside the more; on the left is the road."""
     rng, truth = np.random.default_rng(seed), np.array([1.4, 0.0, 0.0])
     boxes = []
@@ -246,7 +246,7 @@ def test_vehicles_on_a_bank_do_not_pass_for_a_roll_that_is_surely_known(seed: in
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_two_cars_that_pass_slowly_do_not_outvote_those_ahead(seed: int) -> None:
+def test_slow_passing_cars_do_not_outweigh_those_ahead(seed: int) -> None:
     """Their boxes err alike: as they pass, the lower edge moves by 0.07 of the bearing, for 15 s at 30 Hz."""
     rng, truth_m = np.random.default_rng(seed), 1.35
     boxes = []
@@ -266,7 +266,7 @@ def test_two_cars_that_pass_slowly_do_not_outvote_those_ahead(seed: int) -> None
     assert abs(mounting.state[2]) < 0.03
 
 
-def test_an_error_of_the_running_scale_is_in_what_the_road_says_however_many_comparisons_there_are() -> None:
+def test_scale_error_does_not_average_out_over_comparisons() -> None:
     """Each knows a combination of length and pitch exactly: at a scale 2 % too long all of them tilt alike."""
     by_pitch, off_log = 5.0, 0.02  # of the log length; and by how much the running scale is off
     exact = np.outer([1.0, by_pitch, 0.0, 0.0], [1.0, by_pitch, 0.0, 0.0]) / 0.005**2
@@ -335,7 +335,7 @@ def _said(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str
     st.floats(-0.3, 0.3),
     st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4),
 )
-def test_a_camera_file_that_is_written_is_read_as_it_was(
+def test_camera_file_round_trips(
     fisheye: bool, focal_px: float, height_m: float, tilt_rad: float, distortion: list[float]
 ) -> None:
     camera = Camera(
@@ -431,7 +431,7 @@ def test_a_stated_height_that_cars_contradict_is_kept_with_a_sigma_that_covers_b
     assert not any("contradicted" in said for said in verdict(counts(lengths_by(agreed, by, None))))
 
 
-def test_without_a_height_cars_and_lanes_give_it_together_and_what_they_differ_by_widens_it() -> None:
+def test_cars_and_lanes_estimate_the_height_and_disagreement_widens_sigma() -> None:
     cars = HeightCheck(cue="vehicles", height_m=1.2, sigma_m=0.06, samples=12)
     lanes = HeightCheck(cue="lanes", height_m=1.3, sigma_m=0.15, samples=300)
     camera, by = with_height(calibrated(1.5, (cars, lanes)), False, None, "video:town.mp4")
@@ -454,7 +454,7 @@ def test_the_height_by_painted_lanes(height_m: float) -> None:
     assert checks_by_lanes(seen[:40], 1.5, 0.004) == []
 
 
-def test_a_lane_shows_its_width_where_paint_bounds_it_on_both_sides() -> None:
+def test_lane_width_needs_paint_on_both_sides() -> None:
     left, right, kerb = (
         LaneLine(line=k, offset_m=y, slope=0.0, curvature_per_m=0.0, curvature_rate_per_m2=0.0, seen_from_m=5.0,
                  cov=tuple((np.eye(4) * 1e-4).ravel()), seen_to_m=30.0, to_m=40.0, kind=kind)
@@ -484,13 +484,13 @@ def test_a_known_lane_width_sets_the_height(width_m: float) -> None:
 
 
 @pytest.mark.parametrize("text", ["3.5", "lane", "lane=", "lane=nan", "lane=60", "car=4.4x1.8x1.45"])
-def test_a_known_length_that_can_not_be_used_is_refused(text: str) -> None:
+def test_unusable_known_length_is_refused(text: str) -> None:
     with pytest.raises(ConfigurationError, match="expected lane=METRES"):
         lane_width_of(text)
     assert lane_width_of("lane=3.5") == 3.5
 
 
-def test_a_films_sigma_has_the_time_of_its_rows_in_it() -> None:
+def test_sigma_of_a_film_includes_readout_time() -> None:
     """30 ms made 10.8 m/s of a rendered film with 360 rows, f 554 px, 1.35 m too long by 4.5 %.
 
     15 ms are taken out where nothing shows it: 2 sigma cover the half that may be left.

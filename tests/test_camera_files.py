@@ -1,4 +1,4 @@
-"""Calibration files of other projects: the same camera from each, and one clear line for what is none."""
+"""Calibration files of other projects: the same camera from each, and one clear line for an invalid file."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def test_opencvs_models_of_distortion_reach_the_camera(tmp_path: Path, count: in
         ("a.txt", "a film\n", "expected a file of KITTI, ROS"),
     ],
 )
-def test_what_can_not_be_used_is_one_line(tmp_path: Path, name: str, text: str, message: str) -> None:
+def test_unusable_file_is_a_one_line_error(tmp_path: Path, name: str, text: str, message: str) -> None:
     path = written(tmp_path, name, text)
     with pytest.raises(DatasetError, match=message) as error:
         read_intrinsics(path)
@@ -166,9 +166,7 @@ def test_a_damaged_file_is_a_camera_or_one_line(
     format_of(path)
 
 
-def test_a_camera_option_that_names_such_a_file_says_what_it_lacks(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_camera_option_names_missing_keys(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = written(tmp_path, *FILES["Kalibr"])
     assert main(["run", "--source", "usb:0", "--camera", str(path), "--output", str(tmp_path / "out")]) == 2
     text = capsys.readouterr().err

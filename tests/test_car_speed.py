@@ -1,4 +1,4 @@
-"""The car's own speed: readings judged and integrated, the scale factor and the delay learned, faults refused."""
+"""The car's speed: validation, integration, estimation of scale factor and delay, rejection of faults."""
 
 from __future__ import annotations
 
@@ -74,27 +74,29 @@ def test_bad_double_and_shuffled_readings_change_nothing(data: st.DataObject) ->
 
 
 @given(st.floats(0.0, 30.0), st.floats(-2.0, 2.0), st.floats(-0.3, 0.3), st.floats(0.05, 1.0))
-def test_a_way_is_the_speeds_integral(speed_mps: float, acceleration: float, delay_s: float, length_s: float) -> None:
+def test_distance_is_the_integral_of_speed(
+    speed_mps: float, acceleration: float, delay_s: float, length_s: float
+) -> None:
     speed = heard(readings_of(lambda t: speed_mps + acceleration * t, 3.0, delay_s=delay_s), 3.0)
     a, b = 1.0, 1.0 + length_s
     exact = speed_mps * length_s + 0.5 * acceleration * (b**2 - a**2)
     assert way(speed, a, b, delay_s)[0] == pytest.approx(exact, abs=1e-4)
 
 
-def test_a_way_is_the_less_sure_the_older_the_last_reading() -> None:
+def test_sigma_of_distance_grows_with_the_age_of_readings() -> None:
     variances = [way(heard(readings_of(lambda t: 10.0, 2.0 - late), 2.0), 1.5, 2.0)[1] for late in (0.0, 0.1, 0.2, 0.4)]
     assert all(np.diff(variances) > 0.0)
     assert heard(readings_of(lambda t: 10.0, 1.0), 2.5).integrate(2 * NS_PER_S, 5 * NS_PER_S // 2, 0.0) is None
 
 
-def test_noise_that_the_readings_do_not_own_up_to_is_seen() -> None:
+def test_understated_noise_is_detected() -> None:
     rng = np.random.default_rng(0)
     noisy = [reading(t, 20.0 + 0.4 * rng.normal(), 0.01) for t in np.arange(0.0, 3.0, 0.02)]
     stated = [reading(t, 20.0, 0.4) for t in np.arange(0.0, 3.0, 0.02)]
     assert way(heard(noisy, 3.0), 2.0, 2.5)[1] == pytest.approx(way(heard(stated, 3.0), 2.0, 2.5)[1], rel=0.5)
 
 
-def test_old_readings_are_told() -> None:
+def test_old_readings_are_reported() -> None:
     readings = readings_of(lambda t: 10.0, 1.0)
     assert heard(readings, 1.1).status == []
     assert heard(readings, 1.0 + CONFIG.late_s + 0.1).status == [Status.CAR_SPEED_LATE]
@@ -164,7 +166,7 @@ class World:
 
 @settings(max_examples=3)
 @given(st.floats(0.95, 1.05), st.floats(-0.1, 0.15), st.floats(0.4, 0.7))
-def test_stop_and_go_under_a_seen_road_teaches_factor_and_delay(factor: float, delay_s: float, rate: float) -> None:
+def test_stop_and_go_determines_factor_and_delay(factor: float, delay_s: float, rate: float) -> None:
     def speed(t: float) -> float:
         return 9.0 * math.sin(rate * t) ** 2
 
@@ -176,14 +178,14 @@ def test_stop_and_go_under_a_seen_road_teaches_factor_and_delay(factor: float, d
     assert world.error == pytest.approx(0.0, abs=0.006)
 
 
-def test_at_one_speed_the_delay_stays_what_it_was() -> None:
+def test_constant_speed_does_not_change_the_delay() -> None:
     world = World()
     world.drive(lambda t: 12.0, readings_of(lambda t: 12.0, 16.0, 1.03, 0.1), (1.0, 15.0), road=True)
     assert world.filter.x[CAR_DELAY] == 0.0
     assert world.sigma(CAR_DELAY) == pytest.approx(CONFIG.sigma_delay_s)
 
 
-def test_without_a_road_the_metres_are_the_cars_and_as_sure_as_its_factor() -> None:
+def test_without_road_the_scale_is_the_cars_with_its_sigma() -> None:
     world = World(unit_m=0.7)
     world.drive(lambda t: 12.0, readings_of(lambda t: 12.0, 9.0, 1.03), (1.0, 8.0), road=False)
     assert world.error == pytest.approx(0.03, abs=0.003)  # the tyres' scale factor is not observable
@@ -191,7 +193,7 @@ def test_without_a_road_the_metres_are_the_cars_and_as_sure_as_its_factor() -> N
     assert world.filter.x[CAR_FACTOR] == pytest.approx(0.0, abs=0.002)
 
 
-def test_what_a_lit_road_taught_holds_in_the_dark() -> None:
+def test_factor_learned_by_day_holds_in_the_dark() -> None:
     readings, world = readings_of(lambda t: 12.0, 41.0, 1.03), World()
     world.drive(lambda t: 12.0, readings, (1.0, 20.0), road=True)
     by_day = world.sigma(0)
@@ -203,7 +205,7 @@ def test_what_a_lit_road_taught_holds_in_the_dark() -> None:
     assert len(alone.filter.x) == STATES  # nothing changes without speed readings
 
 
-def test_a_motion_that_images_see_roughly_is_smoothed_by_readings_that_are_there() -> None:
+def test_readings_smooth_uncertain_image_motion() -> None:
     readings, world = [r for r in readings_of(lambda t: 12.0, 12.0, 1.03) if r.t_ns <= 11.0 * NS_PER_S], World()
     world.trembles = np.random.default_rng(0).normal(0.0, 0.03, 50)
     world.drive(lambda t: 12.0, readings, (1.0, 6.0), road=True)
@@ -225,7 +227,7 @@ def test_a_motion_that_images_see_roughly_is_smoothed_by_readings_that_are_there
     ],
 )
 @pytest.mark.parametrize("from_s", [0.0, 6.0])
-def test_a_wrong_speed_is_refused_and_told_where_the_road_is_seen(
+def test_visible_road_rejects_a_wrong_speed(
     change: Callable[[SpeedReading], SpeedReading], status: Status, from_s: float
 ) -> None:
     def speed(t: float) -> float:
@@ -241,7 +243,7 @@ def test_a_wrong_speed_is_refused_and_told_where_the_road_is_seen(
     assert not world.car.is_measuring
 
 
-def test_a_unit_of_length_that_the_images_lost_is_the_cars_again_where_no_road_says_otherwise() -> None:
+def test_lost_scale_is_restored_from_the_cars_speed() -> None:
     readings, world = readings_of(lambda t: 12.0 + 0.1 * math.sin(5.0 * t), 30.0), World()
     world.drive(lambda t: 12.0, readings, (1.0, 10.0), road=False)
     world.unit_m *= 1.6  # and the filter does not know
@@ -251,7 +253,7 @@ def test_a_unit_of_length_that_the_images_lost_is_the_cars_again_where_no_road_s
     assert world.car.is_measuring
 
 
-def test_a_number_that_stops_changing_is_no_reading_any_more() -> None:
+def test_frozen_reading_is_rejected() -> None:
     changing = [reading(t, 10.0 + 0.1 * (k % 3), 0.2) for k, t in enumerate(np.arange(0.0, 1.5, 0.02))]
     hung = [reading(t, 10.1, 0.2) for t in np.arange(1.5, 3.5, 0.02)]
     speed = heard([*changing, *hung], 3.5)
@@ -265,7 +267,7 @@ def test_a_number_that_stops_changing_is_no_reading_any_more() -> None:
     assert heard(stopped, 3.5).status == []
 
 
-def test_a_road_that_speaks_thrice_against_the_readings_bars_them() -> None:
+def test_three_contradictions_by_the_road_reject_readings() -> None:
     world = World()
     world.drive(lambda t: 12.0, readings_of(lambda t: 18.0, 6.0), (1.0, 5.0), road=False)
     for _ in range(2):
@@ -298,7 +300,7 @@ def driven(
     return chained, motions
 
 
-def test_the_first_motion_is_in_metres_and_a_night_is_driven_through() -> None:
+def test_first_motion_is_metric_also_at_night() -> None:
     truth = street([(0.8, 0.0)] * 36)
     chained, motions = driven(truth, readings_of(lambda t: 8.0, 5.0), lambda k: 6 <= k < 26)
     assert not INVALIDATING & set(motions[0].status)
@@ -312,7 +314,7 @@ def test_the_first_motion_is_in_metres_and_a_night_is_driven_through() -> None:
     assert len(chained) == len(truth)
 
 
-def test_a_car_that_begins_in_the_dark_is_followed_by_its_speed_and_yaw_rate() -> None:
+def test_start_in_the_dark_follows_speed_and_yaw_rate() -> None:
     turning = [reading(t, 5.0, 0.05, 0.2) for t in np.arange(0.0, 4.0, 0.02)]
     _, motions = driven(street([(0.5, 0.0)] * 30), turning, lambda k: True)
     assert len(motions) == 30  # the first image has none before it
@@ -327,7 +329,7 @@ def test_a_car_that_begins_in_the_dark_is_followed_by_its_speed_and_yaw_rate() -
     assert driven(street([(0.5, 0.0)] * 3), [], lambda k: True)[1] == []
 
 
-def test_a_hanging_camera_is_reported_until_it_recovers() -> None:
+def test_frozen_camera_is_reported_until_it_recovers() -> None:
     odometry, image = Odometry(CAMERA), render(street([])[0])
     for k in range(30):
         now_ns = k * NS_PER_S // 10
@@ -339,7 +341,7 @@ def test_a_hanging_camera_is_reported_until_it_recovers() -> None:
             assert motion.speed_sources == (SpeedSource.CAR,)
 
 
-def test_the_papers_scale_does_not_hear_the_car() -> None:
+def test_paper_mode_ignores_the_cars_speed() -> None:
     config = OdometryConfig(road=RoadScaleConfig(mode="paper"))
     truth = street([(0.8, 0.0)] * 4)
     told = driven(truth, readings_of(lambda t: 20.0, 1.0), lambda k: k == 3, config)[1]
@@ -348,7 +350,7 @@ def test_the_papers_scale_does_not_hear_the_car() -> None:
     assert [m.status for m in told] == [m.status for m in silent]
 
 
-def test_a_guessed_turn_is_not_believed_for_long_and_costs_no_epoch() -> None:
+def test_guessed_turn_is_used_briefly_without_new_epoch() -> None:
     gate = PlausibilityGate(PlausibilityConfig(blind_s=0.5, steady_s=0.5))
 
     def moved(frame: int) -> Measurements:

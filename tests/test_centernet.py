@@ -122,7 +122,7 @@ def test_a_class_without_a_channel_is_refused(tmp_path: Path) -> None:
         load(tmp_path, MANIFEST.replace("2 = ", "3 = "), maps([]))
 
 
-def test_numbers_gone_wild_stay_in_bounds() -> None:
+def test_extreme_numbers_stay_in_bounds() -> None:
     table = CenterNet(heat_map="hm", sizes="wh", heat="logits", classes=3, labels={0: "car"}, score_threshold=0.1)
     stretch = Input(name="i", width_px=64, height_px=32, layout="NCHW", colour="BGR", resize=Stretch())
     shapes = {k: v.shape for k, v in maps([]).items()}
@@ -136,7 +136,7 @@ def test_numbers_gone_wild_stay_in_bounds() -> None:
     assert (boxes <= [640, 320, 640, 320]).all()
 
 
-def test_a_manifest_says_how_sure_the_edges_of_its_boxes_are(tmp_path: Path) -> None:
+def test_manifest_states_the_sigma_of_edges(tmp_path: Path) -> None:
     image, objects = np.zeros((64, 256, 3), np.uint8), [(0, (8.0, 8.0, 20.0, 16.0), 0.6)]
     assert load(tmp_path, MANIFEST, maps(objects)).run(image).detections.edge_sigma is None
     said = MANIFEST + "box_sigma = { rel = 0.1, px = 1.5 }\n"

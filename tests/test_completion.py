@@ -1,4 +1,4 @@
-"""The completion of lane grids: a file that doesn't fit is refused with its reason, and the shipped one completes."""
+"""The completion of lane grids: an unsuitable file is refused with its reason, and the shipped one completes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def test_a_network_of_the_right_shape_is_taken(tmp_path: Path) -> None:
     np.testing.assert_array_equal(complete(grids), grids)
 
 
-def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
+def test_unsuitable_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match=r"none\.onnx: the network can't be read"):
         GridCompletion(SHAPE, tmp_path / "none.onnx")
     (tmp_path / "text.onnx").write_text("no network")
@@ -32,7 +32,7 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not SHIPPED.is_file(), reason="built without the lane network")
-def test_the_shipped_network_joins_a_line_where_something_hid_it() -> None:
+def test_shipped_network_joins_a_hidden_line() -> None:
     grids = np.zeros((2, *SHAPE), dtype=np.float32)
     grids[ROAD, :92, 44:84] = 1.0  # 10 m wide, seen up to 15 m ahead
     grids[BOUNDARY, :92, 63:65] = 1.0

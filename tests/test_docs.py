@@ -141,7 +141,7 @@ def test_every_key_in_the_pages_exists() -> None:
 
 
 @pytest.mark.parametrize(("subject", "status"), [("x" * 72, 0), ("é" * 72, 0), ("x" * 73, 1)])
-def test_a_commit_with_a_long_subject_is_refused(tmp_path: Path, subject: str, status: int) -> None:
+def test_long_commit_subject_is_refused(tmp_path: Path, subject: str, status: int) -> None:
     message = tmp_path / "message"
     message.write_text(f"# a comment of git, {'of whatever length, ' * 5}is no subject\n{subject}\n")
     done = subprocess.run([str(ROOT / ".ci" / "commit-subject"), str(message)], capture_output=True, text=True)

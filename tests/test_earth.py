@@ -202,7 +202,7 @@ GGA = "GPGGA,{},4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,"
 
 
 @pytest.mark.parametrize("before", [b"", b"[1541616573000]", b" "])
-def test_nmea_is_recognized_behind_what_dashcams_write_before_it(before: bytes) -> None:
+def test_nmea_is_recognized_after_a_dashcam_header(before: bytes) -> None:
     """The first line is cut off; each sentence may have a time in brackets."""
     (fix,) = read_fixes(b"31.000,E,022.4,084.4*11\r\n" + before + sentence(RMC), "a.nmea", 0)
     assert fix.latitude_deg == pytest.approx(48.0 + 7.038 / 60.0)

@@ -73,7 +73,7 @@ def test_vehicle_name_matches_only_its_own_keys(name: str, topic: str) -> None:
         st.text(_LETTERS, max_size=60), st.builds("birdslam/{}/v1/{}".format, *[st.text(_LETTERS, max_size=34)] * 2)
     )
 )
-def test_a_received_key_names_one_vehicle_or_none(key: str) -> None:
+def test_received_key_names_at_most_one_vehicle(key: str) -> None:
     found = vehicle_and_topic(key)
     if found is not None:
         vehicle, topic = found

@@ -23,7 +23,7 @@ signal.pause()
 
 
 @pytest.mark.processes
-def test_what_a_killed_suite_started_is_killed_too() -> None:
+def test_processes_of_a_killed_suite_are_killed() -> None:
     with subprocess.Popen([sys.executable, "-c", SUITE], stdout=subprocess.PIPE, text=True) as suite:
         assert suite.stdout is not None
         pidfds = [os.pidfd_open(int(pid)) for pid in suite.stdout.readline().split()]

@@ -455,7 +455,7 @@ def test_hidden_road_behind_a_parked_car_contains_a_child() -> None:
     assert hidden_fans((msgspec.structs.replace(car, T_world_vehicle=SE2(-10.0, 3.0, 0.0)),), SE2(), 1.65) == ()
 
 
-def test_the_example_stops_for_a_person_ahead_and_for_nobody_else() -> None:
+def test_example_stops_only_for_a_person_ahead() -> None:
     example = Path(__file__).resolve().parent.parent / "docs" / "examples" / "stop_for_people.py"
     who_stops_us = runpy.run_path(str(example))["who_stops_us"]
     scene = Scene()

@@ -332,7 +332,7 @@ def test_ratios_are_within_bounds() -> None:
     assert not ratios.worse(found, bounds), found
 
 
-def test_interrupting_the_suite_keeps_what_it_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupted_suite_keeps_its_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(step: everything.Step, options: SimpleNamespace) -> str:
         if step.file == "optimizer":
             return "interrupted"

@@ -78,7 +78,7 @@ def test_first_difference_is_named_to_the_last_bit(tmp_path: Path) -> None:
     assert replay_command.run(options(tape.path)) == 1
 
 
-def test_frames_that_were_coasted_over_and_measurements_that_came_too_late(tmp_path: Path) -> None:
+def test_coasted_frames_and_late_measurements_are_replayed(tmp_path: Path) -> None:
     tape, frames = Tape(tmp_path), measured(30)
     for measurements in frames[:10]:
         tape.step(measurements)
@@ -97,7 +97,7 @@ def test_frames_that_were_coasted_over_and_measurements_that_came_too_late(tmp_p
     assert verdict.equal == len(tape.estimates)
 
 
-def test_a_frame_that_was_written_after_the_estimate_that_predicts_it(tmp_path: Path) -> None:
+def test_frame_written_after_its_prediction_is_replayed(tmp_path: Path) -> None:
     """As by a recorder that had to wait for a core."""
     tape, frames = Tape(tmp_path), measured(20)
     for measurements in frames[:10]:
@@ -158,7 +158,7 @@ def test_measurements_of_a_frame_published_before_the_restart_enter_the_restored
     assert (verdict.restarts, verdict.epochs, verdict.unanswered) == (1, 1, 1)
 
 
-def test_a_graph_that_went_on_from_an_old_checkpoint_is_not_compared_until_a_new_epoch(tmp_path: Path) -> None:
+def test_graph_from_an_old_checkpoint_is_compared_after_a_new_epoch(tmp_path: Path) -> None:
     """Perceive was too busy to send what came since: that checkpoint is in no recording."""
     tape, frames = Tape(tmp_path), iter(measured(40))
     for measurements in itertools.islice(frames, 15):
@@ -184,7 +184,7 @@ def test_a_graph_that_went_on_from_an_old_checkpoint_is_not_compared_until_a_new
     assert verdict.equal == len(tape.estimates) - 2
 
 
-def test_a_restart_that_took_longer_than_perceive_keeps_measurements(tmp_path: Path) -> None:
+def test_long_restart_is_replayed(tmp_path: Path) -> None:
     """The checkpoint is whole, but nothing ties it to the oldest of them: a new world, and nothing was restored."""
     tape, frames = Tape(tmp_path), measured(60)
     for measurements in frames[:20]:
@@ -219,7 +219,7 @@ def test_new_epoch_without_restart_is_a_difference(tmp_path: Path) -> None:
     assert verdict.difference.frame_id == frames[10].frame_id
 
 
-def test_measurements_that_the_recorder_never_had_end_the_comparison_until_a_new_epoch(tmp_path: Path) -> None:
+def test_lost_measurements_end_the_comparison_until_a_new_epoch(tmp_path: Path) -> None:
     tape, frames = Tape(tmp_path), measured(40)
     for measurements in frames[:10]:
         tape.step(measurements)
@@ -262,9 +262,7 @@ def test_new_epoch_with_lost_first_estimate_is_not_a_difference(tmp_path: Path, 
 
 @pytest.mark.parametrize("lost", [1, 2])
 @pytest.mark.parametrize("dead", [0, 1])
-def test_an_epoch_that_began_in_a_process_killed_before_its_estimates_left(
-    tmp_path: Path, lost: int, dead: int
-) -> None:
+def test_epoch_of_a_process_killed_before_its_estimates_is_replayed(tmp_path: Path, lost: int, dead: int) -> None:
     """The next process restores the checkpoint of an unpublished epoch."""
     tape, frames = Tape(tmp_path), iter(measured(40))
     for measurements in itertools.islice(frames, 10):
@@ -351,7 +349,7 @@ def test_random_restarts_give_no_difference(events: list[str], seed: int) -> Non
 
 
 @pytest.mark.parametrize("late", [False, True])
-def test_a_file_that_begins_in_the_middle_of_a_drive_replays_from_its_checkpoint(tmp_path: Path, late: bool) -> None:
+def test_file_from_the_middle_of_a_drive_replays_from_its_checkpoint(tmp_path: Path, late: bool) -> None:
     tape, frames = Tape(tmp_path), measured(40)
     for measurements in frames[:15]:
         tape.step(measurements)
@@ -399,7 +397,7 @@ def test_truncated_recording_replays_up_to_its_end(tmp_path: Path) -> None:
     assert "was cut off" in report(verdict, recording)
 
 
-def test_the_last_estimates_of_a_file_that_was_cut_off_may_have_come_before_their_measurements(tmp_path: Path) -> None:
+def test_last_estimates_of_a_truncated_file_may_lack_measurements(tmp_path: Path) -> None:
     tape, frames = Tape(tmp_path), measured(20)
     for measurements in frames[:10]:
         tape.step(measurements)

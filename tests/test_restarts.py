@@ -118,7 +118,7 @@ def test_loop_waiting_for_a_core_is_not_silent() -> None:
     assert silence.own_s(2, 3.0, {7: 44.0}) == 3.0
 
 
-def test_a_loop_whose_lock_is_held_by_a_thread_that_waits_for_a_core_is_not_silent() -> None:
+def test_loop_blocked_by_a_thread_waiting_for_a_core_is_not_silent() -> None:
     """zenoh's threads take the interpreter's lock for each message, and at load 13 wait with it."""
     silence = Silence()
     silence.own_s(1, 0.0, {7: 5.0, 8: 2.0})
@@ -187,7 +187,7 @@ def test_without_systemd_nothing_is_sent() -> None:
     notifier.alive("x")
 
 
-def test_another_process_s_watchdog_is_not_ours(systemd: socket.socket) -> None:
+def test_watchdog_of_another_process_is_ignored(systemd: socket.socket) -> None:
     environment = {"NOTIFY_SOCKET": systemd.getsockname(), "WATCHDOG_USEC": "300000", "WATCHDOG_PID": str(os.getppid())}
     notifier = Notifier(environment)
     assert notifier.period_s is None
