@@ -83,7 +83,7 @@ def test_distance_is_the_integral_of_speed(
     assert way(speed, a, b, delay_s)[0] == pytest.approx(exact, abs=1e-4)
 
 
-def test_sigma_of_distance_grows_with_the_age_of_readings() -> None:
+def test_sigma_of_distance_grows_with_age_of_readings() -> None:
     variances = [way(heard(readings_of(lambda t: 10.0, 2.0 - late), 2.0), 1.5, 2.0)[1] for late in (0.0, 0.1, 0.2, 0.4)]
     assert all(np.diff(variances) > 0.0)
     assert heard(readings_of(lambda t: 10.0, 1.0), 2.5).integrate(2 * NS_PER_S, 5 * NS_PER_S // 2, 0.0) is None
