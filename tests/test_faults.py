@@ -43,10 +43,10 @@ def test_faults_in_short(place: Path) -> None:
         for fault in FAULTS:
             if f"{fault.name} {fault.node}" not in SHORT:
                 continue
-            vehicle.settle(0.5)
+            vehicle.wait_until_valid(0.5)
             row = measure(vehicle, fault)
             assert survived(row, BUSY_MACHINE), row
-        vehicle.settle(0.5)
+        vehicle.wait_until_valid(0.5)
         assert vehicle.stop() == 0
     assert left_behind(vehicle.vehicle, vehicle.runtime_dir) == []
 
@@ -58,7 +58,7 @@ def test_every_fault(place: Path, models_dir_if_any: Path | None, capsys: pytest
     rows = []
     with Vehicle(place, *model_options(models_dir_if_any), *record_options(place)) as vehicle:
         for fault in FAULTS:
-            vehicle.settle()
+            vehicle.wait_until_valid()
             rows.append(measure(vehicle, fault))
             with capsys.disabled():
                 print(markdown(rows[-1:]).splitlines()[-1], flush=True)
@@ -84,7 +84,7 @@ def restarted(vehicle: Vehicle, times: int) -> Iterator[str]:
     for number in range(times):
         name = tuple(NODES)[number % len(NODES)]
         vehicle.node(name).kill()
-        vehicle.settle(0.3)
+        vehicle.wait_until_valid(0.3)
         yield name
 
 

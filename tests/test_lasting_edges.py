@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
-from birdslam.graph.factors.lasting_error import kept, sight_factors
+from birdslam.graph.factors.lasting_error import lasting_correlation, line_of_sight_factors
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
@@ -29,7 +29,7 @@ def test_factors_reproduce_covariance_along_line_of_sight(
     covs = np.zeros((1, 3, 3))
     covs[0, :2, :2] = A @ A.T  # singular ones, too
     at = far_m * np.exp(1j * np.array([bearing_rad]))
-    F = sight_factors(at, covs)
+    F = line_of_sight_factors(at, covs)
     np.testing.assert_allclose(F @ F.transpose(0, 2, 1), covs[:, :2, :2], atol=1e-5 * (1.0 + covs.max()))
     across = np.array([-math.sin(bearing_rad), math.cos(bearing_rad)])
     np.testing.assert_allclose(abs(across @ F[0, :, 1]), np.linalg.norm(F[0, :, 1]), rtol=1e-9)
@@ -39,11 +39,14 @@ def test_factors_reproduce_covariance_along_line_of_sight(
 def test_error_is_fully_correlated_without_change(
     now: tuple[float, float], before: tuple[float, float], driven_s: float, memory_s: float
 ) -> None:
-    of, driven = kept(np.array([now]), np.array([before]), np.array([driven_s]), memory_s), np.array([driven_s])
+    of, driven = (
+        lasting_correlation(np.array([now]), np.array([before]), np.array([driven_s]), memory_s),
+        np.array([driven_s]),
+    )
     assert (of >= 0.0).all()
     assert (of <= 1.0).all()
-    np.testing.assert_array_equal(of, kept(np.array([before]), np.array([now]), driven, memory_s))
-    np.testing.assert_array_equal(kept(np.array([now]), np.array([now]), np.zeros(1), memory_s), 1.0)
+    np.testing.assert_array_equal(of, lasting_correlation(np.array([before]), np.array([now]), driven, memory_s))
+    np.testing.assert_array_equal(lasting_correlation(np.array([now]), np.array([now]), np.zeros(1), memory_s), 1.0)
 
 
 def variances(frames: int, ego_mps: float, config: GraphConfig) -> Floats:

@@ -18,7 +18,7 @@ from onnx.external_data_helper import set_external_data
 
 from birdslam.perception import ModelError, ModelSpec, load_network, shipped_manifests
 from birdslam.perception.manifest_file import read_manifest
-from birdslam.perception.onnx_files.onnx_file import has_weights_elsewhere
+from birdslam.perception.onnx_files.onnx_file import has_external_weights
 from birdslam.runtime.cli.commands import parse
 from birdslam.runtime.cli.main import main
 from birdslam.runtime.configuration import ConfigurationError
@@ -194,8 +194,8 @@ def test_weights_in_another_file_are_refused_before_anything_is_read(
     tmp_path: Path, store: Path, capsys: pytest.CaptureFixture[str], inside_subgraph: bool
 ) -> None:
     network = segmenter(tmp_path)
-    assert not has_weights_elsewhere(network.read_bytes())
-    assert has_weights_elsewhere(with_external_data(network, inside_subgraph))
+    assert not has_external_weights(network.read_bytes())
+    assert has_external_weights(with_external_data(network, inside_subgraph))
     assert "its weights are in another file" in refused(capsys, "add", str(network))
     assert left_in(store) == set()
 

@@ -440,7 +440,7 @@ def test_unread_outputs_are_not_computed_and_the_rest_is_bit_identical(shipped: 
     image = np.random.default_rng(5).integers(0, 256, (192, 640, 3), dtype=np.uint8)
     cut = load_network("multitask", ModelSpec(path=str(shipped.path)), unread=("depth",))
     assert cut.run(image).depth is None
-    whole, part = shipped.answer(image), cut.answer(image)
+    whole, part = shipped.raw_outputs(image), cut.raw_outputs(image)
     assert set(part) == set(whole) - {"depth"}
     assert all(part[name].tobytes() == whole[name].tobytes() for name in part)
     content = shipped.path.read_bytes()
@@ -523,11 +523,11 @@ def test_context_block_starts_as_identity() -> None:
     after = Trainer(TrainerConfig(), half=False)
     after.begin(before.state())
     image = torch.rand(1, 3, 64, 128).numpy() * 2.0 - 1.0
-    for name, answer in before.answer(image).items():
-        np.testing.assert_allclose(after.answer(image)[name], answer, rtol=1.3e-6, atol=1e-5)
+    for name, answer in before.raw_outputs(image).items():
+        np.testing.assert_allclose(after.raw_outputs(image)[name], answer, rtol=1.3e-6, atol=1e-5)
     # Pixels outside of a cell's receptive field matter after training of the new blocks
     torch.nn.init.ones_(after.average.module.context[0].norm.weight)
-    assert not np.array_equal(after.answer(image)["depth"], before.answer(image)["depth"])
+    assert not np.array_equal(after.raw_outputs(image)["depth"], before.raw_outputs(image)["depth"])
     with pytest.raises(ValueError, match="context"):
         before.begin(after.state())
 
@@ -545,11 +545,11 @@ def test_fine_block_starts_as_identity() -> None:
         state[name] = {key: value for key, value in state[name].items() if "fine." not in key}
     trainer.begin(state)
     image = torch.rand(1, 3, 64, 128).numpy() * 2.0 - 1.0
-    for name, answer in coarse.answer(image).items():
-        np.testing.assert_allclose(trainer.answer(image)[name], answer, rtol=1.3e-6, atol=1e-5)
+    for name, answer in coarse.raw_outputs(image).items():
+        np.testing.assert_allclose(trainer.raw_outputs(image)[name], answer, rtol=1.3e-6, atol=1e-5)
     torch.nn.init.ones_(trainer.average.module.fine.say.weight)
     for name, sharpened in {"segmentation": True, "depth": True, "heat": False, "body": False}.items():
-        assert np.array_equal(trainer.answer(image)[name], coarse.answer(image)[name]) != sharpened
+        assert np.array_equal(trainer.raw_outputs(image)[name], coarse.raw_outputs(image)[name]) != sharpened
 
 
 @needs_torch

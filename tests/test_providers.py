@@ -23,7 +23,7 @@ from birdslam.types import Frame, Status
 
 SHIPPED = ModelSpec(path=str(SHIPPED_NETWORKS / SHIPPED_MULTITASK))
 IMAGE = np.random.default_rng(1).integers(0, 255, (96, 160, 3), np.uint8)
-ABSENT = next(name for name in ("tensorrt", "cuda", "openvino") if name not in session.providers_here())
+ABSENT = next(name for name in ("tensorrt", "cuda", "openvino") if name not in session.available_providers())
 
 
 stand_in = pytest.mark.filterwarnings("ignore:Duplicate provider")  # the CPU as a provider that always starts
@@ -37,8 +37,8 @@ def test_missing_provider_falls_back_to_cpu_with_reason() -> None:
     fallen, cpu = load_network("multitask", by(ABSENT)), load_network("multitask", by("cpu"))
     assert (fallen.provider, cpu.provider, cpu.fell_back) == ("cpu", "cpu", "")
     assert f"has no {ABSENT}, but cpu" in fallen.fell_back
-    for name, tensor in cpu.answer(IMAGE).items():
-        assert np.array_equal(tensor, fallen.answer(IMAGE)[name])
+    for name, tensor in cpu.raw_outputs(IMAGE).items():
+        assert np.array_equal(tensor, fallen.raw_outputs(IMAGE)[name])
     assert load_network("multitask", by("auto")).provider == "cpu"
 
 
@@ -69,8 +69,8 @@ def test_failing_accelerator_falls_back_to_cpu(monkeypatch: pytest.MonkeyPatch) 
     assert (network.provider, network.fell_back) == ("cpu", "cuda: the device is gone")
     assert found is not None
     monkeypatch.setattr(_Bound, "infer", infer)
-    for name, tensor in cpu.answer(IMAGE).items():
-        assert np.array_equal(tensor, network.answer(IMAGE)[name])
+    for name, tensor in cpu.raw_outputs(IMAGE).items():
+        assert np.array_equal(tensor, network.raw_outputs(IMAGE)[name])
 
 
 class CopiesWhenBound:
@@ -163,7 +163,7 @@ def test_doctor_lists_what_is_there(tmp_path: Path) -> None:
         assert (row.verdict, f"by {provider} of cpu" in row.found) == (verdict, True)
 
 
-@pytest.mark.skipif("openvino" not in session.providers_here(), reason="onnxruntime-openvino is not installed")
+@pytest.mark.skipif("openvino" not in session.available_providers(), reason="onnxruntime-openvino is not installed")
 def test_openvino_agrees_with_cpu() -> None:
     assert compared("multitask", SHIPPED, ("cpu", "openvino"), within_s=0.0)["openvino"].agrees
 

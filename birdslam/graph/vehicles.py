@@ -11,7 +11,7 @@ import numpy as np
 from birdslam.geometry.arrays import Floats
 from birdslam.graph.costs import rotated
 from birdslam.graph.edges import CvEdges, PoseEdges, VvEdges
-from birdslam.graph.factors.lasting_error import sight_factors
+from birdslam.graph.factors.lasting_error import line_of_sight_factors
 from birdslam.types import Moves, VehicleEdge
 
 PATH_HALF_WIDTH_M = 1.75  # half a lane, as in vehicles/state/parallax.py
@@ -59,7 +59,7 @@ def cv_edges(rows: list[int], numbers: Floats) -> CvEdges:
     """Returns the edges, in ego, to the vehicles in these rows of the window, from their `numbers` (k, 12)."""
     at, heading = numbers[:, 0] + 1j * numbers[:, 1], np.exp(1j * numbers[:, 2])
     covs = rotated(numbers[:, 3:].reshape(-1, 3, 3), heading)
-    return CvEdges(rows, at, heading, covs, sight_factors(at, covs))
+    return CvEdges(rows, at, heading, covs, line_of_sight_factors(at, covs))
 
 
 NO_CV = cv_edges([], np.zeros((0, 12)))

@@ -38,7 +38,7 @@ from birdslam.perception.manifest import (
     Yolox,
 )
 from birdslam.perception.manifest_file import find_manifest
-from birdslam.perception.onnx_files.onnx_file import has_weights_elsewhere
+from birdslam.perception.onnx_files.onnx_file import has_external_weights
 from birdslam.perception.onnx_files.unread_outputs import without_outputs
 from birdslam.perception.verge import without_verge
 from birdslam.perception.views import Preparation, View, make_views
@@ -174,7 +174,7 @@ class Network:
         self.provider = "cpu"
         self._bind()
 
-    def _computed(self, apart: bool = False) -> _Bound | None:
+    def _run_session(self, apart: bool = False) -> _Bound | None:
         """Runs on the input; None if an output is not finite. A run that fails on an accelerator repeats on the CPU."""
         from birdslam.perception.session import SESSION_ERRORS
 
@@ -185,7 +185,7 @@ class Network:
             if self.provider == "cpu":
                 raise
             self._fall_back(error)
-            return self._computed(apart)
+            return self._run_session(apart)
 
     def views(self, image: NDArray[np.uint8]) -> tuple[View, ...]:
         """The views of an image, one run each. Raises ValueError if it is not an image."""
@@ -206,7 +206,7 @@ class Network:
 
     def infer(self) -> bool:
         """Runs the network on its input; False if an output is not finite."""
-        return self._computed() is not None
+        return self._run_session() is not None
 
     def read(self, view: View) -> Any:
         """The decoded outputs of the last run, for `merge`."""
@@ -224,7 +224,7 @@ class Network:
         views, parts = self.views(image), []
         for view in views:
             self.prepare(image, view)
-            bound = self._computed(apart)
+            bound = self._run_session(apart)
             if bound is None:
                 return None
             parts.append(self.decoder.read(bound.tensors, view))
@@ -235,7 +235,7 @@ class Network:
             return found
         return replace(found, segmentation=replace(masks, road=without_verge(masks.road, image)))
 
-    def answer(self, image: NDArray[np.uint8]) -> dict[str, Floats32]:
+    def raw_outputs(self, image: NDArray[np.uint8]) -> dict[str, Floats32]:
         """The raw outputs for an image's first view."""
         self.prepare(image, self.views(image)[0])
         self.infer()
@@ -294,7 +294,7 @@ def load_network(
     schedule = msgspec.structs.replace(manifest.schedule, **stated)
     if max_threads is not None and spec.threads is None:
         schedule = msgspec.structs.replace(schedule, threads=min(schedule.threads, max_threads))
-    refuse_weights_elsewhere(path, content)
+    check_weights_are_inside(path, content)
     from birdslam.perception.session import SESSION_ERRORS
 
     try:
@@ -307,10 +307,10 @@ def load_network(
         raise ModelError(f"{path}: onnxruntime can't run this network: {error}") from error
 
 
-def refuse_weights_elsewhere(path: Path, content: bytes) -> None:
+def check_weights_are_inside(path: Path, content: bytes) -> None:
     """Raises ModelError if weights are in another file: the network's SHA-256 would not cover them."""
     try:
-        elsewhere = has_weights_elsewhere(content)
+        elsewhere = has_external_weights(content)
     except ValueError as error:
         raise ModelError(f"{path}: onnxruntime can't run this network: {error}") from error
     if elsewhere:

@@ -22,7 +22,7 @@ from birdslam.geometry.camera import Camera
 from birdslam.perception.boxes3d import Boxes3d
 from birdslam.perception.manifest import ManifestMismatch, ModelError, Schedule
 from birdslam.perception.manifest_file import find_as
-from birdslam.perception.network import ModelSpec, refuse_weights_elsewhere
+from birdslam.perception.network import ModelSpec, check_weights_are_inside
 from birdslam.perception.pointnet_manifest import Bins, Body, PointNetManifest, Points
 
 CORE_RATIO = 0.5  # central part of a box's width and height, which shows its vehicle
@@ -251,7 +251,7 @@ def load_pointnet(spec: ModelSpec) -> PointNet:
     sha256 = hashlib.sha256(content).hexdigest()
     manifest, origin = find_as(path, sha256, spec.manifest, PointNetManifest)
     stated: dict[str, int] = {k: v for k in ("every", "threads") if (v := getattr(spec, k)) is not None}
-    refuse_weights_elsewhere(path, content)
+    check_weights_are_inside(path, content)
     from birdslam.perception.session import SESSION_ERRORS
 
     try:

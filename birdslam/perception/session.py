@@ -50,7 +50,7 @@ class ProviderMissing(Exception):
     """The installed onnxruntime lacks the provider, or the provider does not start on this computer."""
 
 
-def providers_here() -> tuple[str, ...]:
+def available_providers() -> tuple[str, ...]:
     """The EXECUTION_PROVIDERS of the installed onnxruntime, "cpu" first."""
     built = set(ort.get_available_providers())
     return tuple(name for name, theirs in EXECUTION_PROVIDERS.items() if theirs in built)
@@ -113,8 +113,8 @@ def open_session(
     whole = without_tiny_weights(content)
     if provider == "cpu":
         return ort.InferenceSession(whole, options, providers=[CPU])
-    if provider not in providers_here():
-        raise ProviderMissing(f"the installed onnxruntime has {', '.join(providers_here())}, not {provider}")
+    if provider not in available_providers():
+        raise ProviderMissing(f"the installed onnxruntime has {', '.join(available_providers())}, not {provider}")
     wanted = EXECUTION_PROVIDERS[provider]
     missing = _nvidia_libraries() if provider in _NVIDIA else ""
     ort.set_default_logger_severity(_QUIET)

@@ -117,7 +117,7 @@ def read(task: Task, edit: Edit | None = None) -> tuple[str, Drive]:
         camera, poses = mirrored_camera(camera), _MIRROR @ poses @ _MIRROR
     images: list[Image] = []
     t_ns, seen = [], []
-    for frame, looked in zip(recording.frames(), _looks(task.configuration), strict=False):
+    for frame, looked in zip(recording.frames(), _network_results(task.configuration), strict=False):
         if frame.image is None:
             raise DatasetError(f"{task.uri}: image {frame.index}: {frame.error}")
         image = undistort(frame.image)
@@ -136,7 +136,7 @@ def mirrored_camera(camera: Camera) -> Camera:
     return msgspec.structs.replace(camera, cx_px=camera.width_px - 1 - camera.cx_px, roll_rad=-camera.roll_rad)
 
 
-def _looks(configuration: Configuration | None) -> Iterator[Any]:
+def _network_results(configuration: Configuration | None) -> Iterator[Any]:
     """Yields a function from an image to the networks' boxes and road, to be called for each image in order."""
     if configuration is None:
         yield from itertools.repeat(lambda frame: (np.zeros((0, 4)), None))

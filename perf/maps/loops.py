@@ -81,14 +81,14 @@ def recorded(ledger: Ledger, data: Path, kinds: Sequence[FeatureKind]) -> None:
         for name, other, side in (("left", "right", -1.0), ("right", "left", 1.0)):
             camera, frames = passes[name]
             extract = TimedExtractor(kind)
-            kept = encode_map(mapped(camera, frames, extract))
-            found = localised(*passes[other], kept, kind)
+            kept = encode_map(build_map(camera, frames, extract))
+            found = localise(*passes[other], kept, kind)
             truth = [estimate.T_world_ego @ SE2(0.0, side * BASELINE_M, 0.0) for estimate, _ in frames]
-            row = judged(found, truth) | {"MB_a_km": round(len(kept) / 1e3 / max(decode_map(kept).length_m, 1.0), 2)}
+            row = evaluate(found, truth) | {"MB_a_km": round(len(kept) / 1e3 / max(decode_map(kept).length_m, 1.0), 2)}
             row["features_ms"] = round(float(np.median(extract.took_ms)), 1)
             ledger.add(f"{kind}: {other} in the map of {name}", row_text(row), **row, text=row_text(row))
             for street, (street_camera, drive) in others.items():
-                states = localised(street_camera, drive, kept, kind).poses
+                states = localise(street_camera, drive, kept, kind).poses
                 text = f"{len(states)} of {len(drive)} frames localised, all of them falsely"
                 title = f"{kind}: {street} in the map of {name}"
                 ledger.add(title, text, false=len(states), frames=len(drive), text=text)
@@ -108,7 +108,7 @@ class TimedExtractor(FeatureExtractor):
         return out
 
 
-def mapped(camera: Camera, frames: Iterable[Seen], extract: FeatureExtractor) -> PlaceMap:
+def build_map(camera: Camera, frames: Iterable[Seen], extract: FeatureExtractor) -> PlaceMap:
     """The map of a drive."""
     place_map = PlaceMap(MapCamera.of(camera))
     session = MapSession(camera, place_map, True, extract)
@@ -130,7 +130,7 @@ class Localised:
         return [row for row in self.rows if row.state is MapState.LOCALISED]
 
 
-def localised(camera: Camera, frames: Iterable[Seen], kept: bytes, kind: FeatureKind) -> Localised:
+def localise(camera: Camera, frames: Iterable[Seen], kept: bytes, kind: FeatureKind) -> Localised:
     session, trajectory = MapSession(camera, decode_map(kept), False, FeatureExtractor(kind)), MapTrajectory()
     rows: list[Localisation] = []
     for estimate, image in frames:
@@ -139,7 +139,7 @@ def localised(camera: Camera, frames: Iterable[Seen], kept: bytes, kind: Feature
     return Localised(rows, trajectory.frames_before)
 
 
-def judged(trajectory: Localised, truth: Sequence[SE2]) -> dict[str, Any]:
+def evaluate(trajectory: Localised, truth: Sequence[SE2]) -> dict[str, Any]:
     """Errors of the localised frames relative to the map's own drive."""
     found = trajectory.poses
     row: dict[str, Any] = {"frames": len(trajectory.rows), "localised": len(found)}

@@ -50,16 +50,16 @@ def loop(ledger: Ledger, way_m: float) -> None:
         odometry[estimate.t_source_ns] = estimate.T_world_ego
         ends.append((truth[estimate.t_source_ns], estimate.T_world_ego, session.step(estimate, seen)))  # type: ignore[arg-type]
     T_true, T_odom, last = ends[-1]
-    before_m = _apart(T_true, T_odom)
+    before_m = _distance_m(T_true, T_odom)
     session.finish()
-    open_m = max(_apart(truth[each.t_source_ns], odometry[each.t_source_ns]) for each in place_map.keyframes)
-    closed_m = max(_apart(truth[each.t_source_ns], each.T_map_keyframe) for each in place_map.keyframes)
+    open_m = max(_distance_m(truth[each.t_source_ns], odometry[each.t_source_ns]) for each in place_map.keyframes)
+    closed_m = max(_distance_m(truth[each.t_source_ns], each.T_map_keyframe) for each in place_map.keyframes)
     # A loop does not determine the scale: the frame has the scale error of the first drive
     at = np.array([(k.T_map_keyframe.x_m, k.T_map_keyframe.y_m) for k in place_map.keyframes])
     true = np.array([(truth[k.t_source_ns].x_m, truth[k.t_source_ns].y_m) for k in place_map.keyframes])
     scale = float((at * true).sum() / (at**2).sum())
     unscaled_m = float(np.hypot(*(scale * at - true).T).max())
-    end_m = _apart(T_true, last.T_map_ego or T_odom)
+    end_m = _distance_m(T_true, last.T_map_ego or T_odom)
     row: dict[str, Any] = {
         "way_m": 2 * around,
         "end_by_odometry_m": round(before_m, 3),
@@ -84,7 +84,7 @@ def loop(ledger: Ledger, way_m: float) -> None:
         ("other light", 0.0, OTHER_LIGHT_BITS),
         ("other light and lane", 3.0, OTHER_LIGHT_BITS),
     ):
-        share, worst_m = _again(kept, street, rows, lateral_m, bits, first or SE2())
+        share, worst_m = _localise_again(kept, street, rows, lateral_m, bits, first or SE2())
         text = f"{100 * share:.0f} % localised, worst {worst_m:.2f} m"
         ledger.add(f"loop: {name}", text, localised=share, worst_m=worst_m, text=text)
 
@@ -163,11 +163,13 @@ def _session(place_map: PlaceMap, extend: bool) -> MapSession:
     return MapSession(CAMERA, place_map, extend, lambda features: features)  # type: ignore[arg-type]
 
 
-def _apart(a: SE2, b: SE2) -> float:
+def _distance_m(a: SE2, b: SE2) -> float:
     return float(np.hypot(a.x_m - b.x_m, a.y_m - b.y_m))
 
 
-def _again(kept: bytes, street: Street, rows: range, lateral_m: float, bits: float, first: SE2) -> tuple[float, float]:
+def _localise_again(
+    kept: bytes, street: Street, rows: range, lateral_m: float, bits: float, first: SE2
+) -> tuple[float, float]:
     """The share of localised frames, and their worst error relative to the nearest keyframe."""
     session = _session(decode_map(kept), extend=False)
     frames, errors = 0, [0.0]
@@ -177,7 +179,7 @@ def _again(kept: bytes, street: Street, rows: range, lateral_m: float, bits: flo
         frames += 1
         if found.state is MapState.LOCALISED and found.T_map_ego is not None:
             localised_frames += 1
-            errors.append(_apart(found.T_map_ego, first.between(T)))
+            errors.append(_distance_m(found.T_map_ego, first.between(T)))
     return round(localised_frames / frames, 3), round(max(errors), 3)
 
 

@@ -62,9 +62,9 @@ def measure(ledger: Ledger, drives: Path) -> None:
             drive = _Drive.open(drives / name)
             frames = before.get(name) or estimated(f"demo:{drives / name}")
             found = _localise(kept, drive, frames)
-            row = _judged(found, drive.truth, place_map, T_world_map)
+            row = _evaluate(found, drive.truth, place_map, T_world_map)
             ledger.add(f"town: {differs}", row["text"], **row)
-    _kidnapped(ledger, drives, kept, place_map, T_world_map, before)
+    _measure_jump(ledger, drives, kept, place_map, T_world_map, before)
 
 
 def render(folder: Path) -> dict[str, str]:
@@ -115,16 +115,16 @@ def _twice(ledger: Ledger, folder: Path) -> tuple[PlaceMap, dict[int, SE2]]:
     way_m = float(np.hypot(*np.diff([(T.x_m, T.y_m) for T in drive.truth], axis=0).T).sum())
     end = T_map_world @ drive.truth[-1]
     T_end = session.localiser.T_map_odom @ odometry[last.t_source_ns] if session.localiser.T_map_odom else None
-    open_m, closed_m = _apart(end, odometry[last.t_source_ns]), _apart(end, T_end) if T_end else float("inf")
+    open_m, closed_m = _distance_m(end, odometry[last.t_source_ns]), _distance_m(end, T_end) if T_end else float("inf")
     keyframes = [
-        (_apart(T_map_world @ truth[k.t_source_ns], odometry[k.t_source_ns]),
-         _apart(T_map_world @ truth[k.t_source_ns], k.T_map_keyframe))
+        (_distance_m(T_map_world @ truth[k.t_source_ns], odometry[k.t_source_ns]),
+         _distance_m(T_map_world @ truth[k.t_source_ns], k.T_map_keyframe))
         for k in place_map.keyframes
     ]  # fmt: skip
     worst_open_m, worst_m = np.max(keyframes, axis=0)
     at = {k.number: truth[k.t_source_ns] for k in place_map.keyframes}
     loops = [link for link in place_map.links if link.loop]
-    false = sum(_apart(at[e.from_number].between(at[e.to_number]), e.T_from_to) > FALSE_M for e in loops)
+    false = sum(_distance_m(at[e.from_number].between(at[e.to_number]), e.T_from_to) > FALSE_M for e in loops)
     size = len(encode_map(place_map))
     text = (
         f"{way_m:.0f} m; end error {open_m:.2f} m by odometry ({100 * open_m / way_m:.2f} %), {closed_m:.2f} m after "
@@ -140,7 +140,7 @@ def _twice(ledger: Ledger, folder: Path) -> tuple[PlaceMap, dict[int, SE2]]:
     return place_map, at
 
 
-def _apart(a: SE2, b: SE2) -> float:
+def _distance_m(a: SE2, b: SE2) -> float:
     return float(np.hypot(a.x_m - b.x_m, a.y_m - b.y_m))
 
 
@@ -152,12 +152,12 @@ def _localise(kept: bytes, drive: _Drive, frames: Iterable[Seen]) -> list[Locali
 def _errors(found: Localisation, true: SE2, place_map: PlaceMap, at: dict[int, SE2]) -> Floats:
     """Error of a pose relative to the nearest keyframe; the keyframes measure the distortion of the map."""
     assert found.T_map_ego is not None
-    nearest = min(place_map.keyframes, key=lambda k: _apart(k.T_map_keyframe, found.T_map_ego))  # type: ignore[arg-type]
+    nearest = min(place_map.keyframes, key=lambda k: _distance_m(k.T_map_keyframe, found.T_map_ego))  # type: ignore[arg-type]
     T_true = at[nearest.number].between(true)
     return T_true.between(nearest.T_map_keyframe.between(found.T_map_ego)).log()
 
 
-def _judged(found: list[Localisation], truth: list[SE2], place_map: PlaceMap, at: dict[int, SE2]) -> dict[str, Any]:
+def _evaluate(found: list[Localisation], truth: list[SE2], place_map: PlaceMap, at: dict[int, SE2]) -> dict[str, Any]:
     poses = [each for each in found if each.state is MapState.LOCALISED]
     row: dict[str, Any] = {"frames": len(found), "localised": len(poses), "false": 0}
     text = f"{len(poses)} of {len(found)} frames localised"
@@ -179,7 +179,7 @@ def _judged(found: list[Localisation], truth: list[SE2], place_map: PlaceMap, at
     return row | {"text": text}
 
 
-def _kidnapped(
+def _measure_jump(
     ledger: Ledger, drives: Path, kept: bytes, place_map: PlaceMap, at: dict[int, SE2], seen: dict[str, list[Seen]]
 ) -> None:
     """The car jumps to another place while the odometry continues."""
@@ -200,7 +200,7 @@ def _kidnapped(
         )  # fmt: skip
         found = session.step(moved, image)
         true = then.truth[estimate.frame_id]
-        way_m, T_last = way_m + _apart(true, T_last), true
+        way_m, T_last = way_m + _distance_m(true, T_last), true
         if found.state is MapState.LOCALISED:
             error = _errors(found, true, place_map, at)
             if np.hypot(*error[:2]) > FALSE_M:

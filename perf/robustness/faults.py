@@ -19,7 +19,7 @@ from birdslam.perf.reporting.machine import describe
 from birdslam.perf.robustness.faulty_vehicle import (
     PATIENCE_S,
     Vehicle,
-    ends_with_its_vehicle,
+    exit_on_sigterm,
     model_options,
     record_options,
 )
@@ -77,12 +77,12 @@ def measure(vehicle: Vehicle, fault: Fault) -> Row:
         ended_ns = time.monotonic_ns()
     blind = (begun_ns + 3 * vehicle.period_ns, ended_ns - vehicle.period_ns) if fault.blind else None
 
-    def well(estimate: Estimate | None) -> bool:
+    def is_well(estimate: Estimate | None) -> bool:
         judge.see(estimate)
         return estimate is not None and estimate.valid and estimate.t_capture_ns >= ended_ns
 
     # Time counts from the start of a fault of a process, from the end of a fault of the environment
-    back = vehicle.watch(well, PATIENCE_S)
+    back = vehicle.watch(is_well, PATIENCE_S)
     after_ms = (judge.estimates[-1][0] - ended_ns) / 1e6 if back else None
     seen = judge.summary()
     vehicle.watch(observe, AFTER_S)
@@ -131,7 +131,7 @@ def run(arguments: list[str]) -> int:
     parser.add_argument("--models", type=Path, help="folder of networks for perceive")
     parser.add_argument("--markdown", type=Path, help="file for the page")
     options = parser.parse_args(arguments)
-    ends_with_its_vehicle()
+    exit_on_sigterm()
     chosen = [f for f in FAULTS if not options.names or any(name in f"{f.name} {f.node}" for name in options.names)]
     rows: list[Row] = []
     with (
@@ -140,7 +140,7 @@ def run(arguments: list[str]) -> int:
     ):
         for number, fault in enumerate(chosen):
             if number:
-                vehicle.settle()
+                vehicle.wait_until_valid()
             rows.append(measure(vehicle, fault))
             print(markdown(rows[-1:]).splitlines()[-1], flush=True)
     print(f"\n{markdown(rows)}")

@@ -35,7 +35,7 @@ WITHOUT_SPARES = ("--set", "runtime.spares=false")
 VITALS = "memfd:birdslam-vitals"
 
 
-def ends_with_its_vehicle() -> None:
+def exit_on_sigterm() -> None:
     """Makes SIGTERM end the suite and its vehicle, as Ctrl-C does."""
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
 
@@ -118,10 +118,10 @@ class Vehicle:
 
     def __enter__(self) -> Self:
         self.planner = Planner(self.vehicle, self.runtime_dir)
-        self.settle()
+        self.wait_until_valid()
         return self
 
-    def settle(self, settle_s: float = SETTLE_S) -> None:
+    def wait_until_valid(self, settle_s: float = SETTLE_S) -> None:
         """Waits until estimates have been valid for `settle_s` and all spares are prepared.
 
         Spares load at idle priority, which may take forever on a busy machine; their priority is raised here.

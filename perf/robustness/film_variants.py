@@ -57,7 +57,9 @@ class Variant:
 
     def images(self, film: Iterator[Timed], folder: Path) -> Iterator[Timed]:
         """The changed images of a film; `folder` is for encoded files."""
-        yield from _encoded(self._repeated(self._resized(_woven(film) if self.interlaced else film)), self.crf, folder)
+        yield from _encoded(
+            self._repeated(self._resized(_interlaced(film) if self.interlaced else film)), self.crf, folder
+        )
 
     def _repeated(self, film: Iterator[Timed]) -> Iterator[Timed]:
         before: Timed | None = None
@@ -114,7 +116,7 @@ def _other(size: float, every: int) -> Variant:
     return Variant(", ".join(parts) or "unchanged", size=size, every=every)
 
 
-def _woven(film: Iterator[Timed]) -> Iterator[Timed]:
+def _interlaced(film: Iterator[Timed]) -> Iterator[Timed]:
     """Interlaced images: rows of two times in each; drops the last image."""
     first: Timed | None = None
     for t_ns, image in film:

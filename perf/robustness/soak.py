@@ -31,7 +31,7 @@ from birdslam.geometry.arrays import Floats
 from birdslam.loops.map_file import MapError
 from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.reporting.figures import BLOCKS
-from birdslam.perf.robustness.faulty_vehicle import Vehicle, ends_with_its_vehicle, model_options, record_options
+from birdslam.perf.robustness.faulty_vehicle import Vehicle, exit_on_sigterm, model_options, record_options
 from birdslam.runtime.maps.map_store import read_map
 from birdslam.runtime.transport.closing import Closing
 
@@ -281,7 +281,7 @@ def run(arguments: list[str]) -> int:
     parser.add_argument("--record", action="store_true", help="run a recorder too")
     parser.add_argument("--models", type=Path, help="folder of networks")
     options, more = parser.parse_known_args(arguments)
-    ends_with_its_vehicle()
+    exit_on_sigterm()
     with tempfile.TemporaryDirectory(prefix="soak") as folder, Systemd(Path(folder)) as systemd:
         place = Path(folder)
         recorded = record_options(place) if options.record else []

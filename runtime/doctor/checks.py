@@ -223,9 +223,9 @@ def _models(configuration: Configuration) -> Iterator[Finding]:
     specs = configuration.models.in_use()
     if not specs:
         yield Finding("models", "warning", "none: odometry only", "omit --model none to run the shipped network")
-    from birdslam.perception.session import providers_here
+    from birdslam.perception.session import available_providers
 
-    here = ", ".join(providers_here())
+    here = ", ".join(available_providers())
     for role, spec in specs.items():
         asked = spec.provider or configuration.perceive.provider
         try:

@@ -114,9 +114,9 @@ class Inference(Closing):
         specs: dict[str, ModelSpec], configuration: Configuration, max_threads: int | None
     ) -> dict[str, ModelSpec]:
         """Selects the provider of each network; at rate "max" the CPU, so that runs are reproducible."""
-        from birdslam.perception.session import providers_here
+        from birdslam.perception.session import available_providers
 
-        asked, here = configuration.perceive.provider, ("cpu",) if configuration.lossless else providers_here()
+        asked, here = configuration.perceive.provider, ("cpu",) if configuration.lossless else available_providers()
         return {role: chosen(role, spec, asked, here, max_threads) for role, spec in specs.items()}
 
     def _submit(self, run: Run, *arguments: Any) -> Future[Any]:

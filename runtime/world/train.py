@@ -190,7 +190,7 @@ class Training:
         """Evaluates the averaged network on held-out worlds; returns metrics and thresholds, appends to grades.csv."""
         size_px = (stage.width_px, stage.height_px)
         rng = np.random.default_rng([self.config.seed, number])
-        figures = validate(self.trainer.answer, _render, size_px, frames, self.config.stream.augmentation, rng)
+        figures = validate(self.trainer.raw_outputs, _render, size_px, frames, self.config.stream.augmentation, rng)
         _append(self.output / "grades.csv", {"stage": number, "step": self.step, **figures})
         print("  ".join(f"{name} {value:.3f}" for name, value in figures.items()), flush=True)
         return figures

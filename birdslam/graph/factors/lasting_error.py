@@ -16,7 +16,7 @@ DRIVING_MPS = 1.0  # the view changes well above this speed (as in vehicles/stat
 _MIN_M2 = 1e-12
 
 
-def sight_factors(at: Complexes, covs: Floats) -> Floats:
+def line_of_sight_factors(at: Complexes, covs: Floats) -> Floats:
     """Factors F (k, 2, 2) of the position covariances FF' in `covs` (k, 3, 3); column 0 is along the line of sight."""
     along = at / np.maximum(np.abs(at), 1e-9)
     axes = np.array([[along.real, -along.imag], [along.imag, along.real]]).transpose(2, 0, 1)
@@ -36,7 +36,7 @@ def relative_sigmas(edges: CvEdges) -> Floats:
     return out
 
 
-def kept(sigma_rel: Floats, sigma_before_rel: Floats, driven_s: Floats, memory_s: float) -> Floats:
+def lasting_correlation(sigma_rel: Floats, sigma_before_rel: Floats, driven_s: Floats, memory_s: float) -> Floats:
     """Correlation (k, 2) of the lasting errors with those of the previous edges, `driven_s` (k,) of driving ago.
 
     It drops when the sigma shrinks (new measurements) and when it grows (new errors).

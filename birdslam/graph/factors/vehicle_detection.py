@@ -8,7 +8,7 @@ import numpy as np
 
 from birdslam.graph.costs import binary_residuals
 from birdslam.graph.factors.factor import Factor, GraphFrame, Linearised
-from birdslam.graph.factors.lasting_error import DRIVING_MPS, kept, relative_sigmas
+from birdslam.graph.factors.lasting_error import DRIVING_MPS, lasting_correlation, relative_sigmas
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.state_layout import LASTING, OF_VEHICLE, POSE
 from birdslam.graph.vehicles import MIN_INTERVAL_S
@@ -39,7 +39,7 @@ class VehicleDetections(Factor):
             sigma_rel = relative_sigmas(edges)
             ego_mps = math.hypot(frame.motion.x_m, frame.motion.y_m) / max(frame.passed_s, MIN_INTERVAL_S)
             driven_s = frame.associations.dt_s[edges.rows] * -math.expm1(-ego_mps / DRIVING_MPS)
-            same = kept(sigma_rel, window.sigma_rel[edges.rows], driven_s, self._memory_s)
+            same = lasting_correlation(sigma_rel, window.sigma_rel[edges.rows], driven_s, self._memory_s)
             window.fade_lasting(edges.rows, same, sigma_rel)
         if self._front_back_ambiguity and edges.rows:
             opposed = (edges.heading * window.heading[window.nodes :][edges.rows].conj()).real < 0.0

@@ -138,7 +138,7 @@ def edge_sigma(table: BoxSigma | None, view: View) -> EdgeSigma | None:
     return EdgeSigma((left, right, upper, lower), table.px / float(view.ratio.min()))
 
 
-def drawn_out(boxes_px: Floats, inside: DrawnInside, view: View) -> Floats:
+def move_edges_outward(boxes_px: Floats, inside: DrawnInside, view: View) -> Floats:
     """Moves the edges of boxes (N, 4) of the image out to the object's outline; edges at the border stay."""
     width, height = (boxes_px[:, 2:] - boxes_px[:, :2]).T
     moves = [-inside.left * width, -inside.upper * height, inside.right * width, inside.lower * height]
@@ -184,7 +184,7 @@ def merge_views(parts: Sequence[Candidates], views: Sequence[View], groups: Ints
     boxes, alive = join_halves(boxes, groups[classes], cut, slack_px)
     order = alive[np.argsort(-scores[alive], kind="stable")]
     labels = tuple(table.labels[int(c)] for c in classes[order])
-    outlines = drawn_out(boxes[order], table.drawn_inside, views[0])
+    outlines = move_edges_outward(boxes[order], table.drawn_inside, views[0])
     sigma = edge_sigma(table.box_sigma, views[0])
     return Detections(outlines, scores[order], labels, edge_sigma=sigma, lower_edge=table.lower_edge)
 

@@ -16,7 +16,7 @@ import numpy as np
 from birdslam.geometry.arrays import Floats, Floats32, Ints
 from birdslam.perception.boxes3d import Boxes3d
 from birdslam.perception.decoding.depth import DepthMap
-from birdslam.perception.decoding.detection import Detections, drawn_out, edge_sigma, suppress
+from birdslam.perception.decoding.detection import Detections, edge_sigma, move_edges_outward, suppress
 from birdslam.perception.decoding.segmentation import Segmentation
 from birdslam.perception.manifest import Input, Label, ManifestMismatch, MultiTask
 from birdslam.perception.views import View
@@ -133,7 +133,7 @@ class MultiTaskDecoder:
         kinds = np.argmax(at[rows, _BODY["kind"]], axis=1)
         labels = tuple(KINDS[k] if c == 0 else "person" for c, k in zip(classes[rows], kinds, strict=True))
         bodies = self._bodies(at[rows], cells[rows], view, focal_rel)
-        outlines = drawn_out(boxes[rows], self.table.drawn_inside, view)
+        outlines = move_edges_outward(boxes[rows], self.table.drawn_inside, view)
         sigma = edge_sigma(self.table.box_sigma, view)
         return Detections(outlines, scores[rows], labels, bodies, sigma, self.table.lower_edge)
 

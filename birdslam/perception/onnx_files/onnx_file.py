@@ -44,7 +44,7 @@ def fields(data: bytes | bytearray, at: int, end: int) -> Iterator[tuple[int, in
         yield key >> 3, value, span, at
 
 
-def has_weights_elsewhere(content: bytes) -> bool:
+def has_external_weights(content: bytes) -> bool:
     """Whether a tensor of the network is in another file, at a path that the network names.
 
     Raises ValueError if the bytes are not an ONNX file.

@@ -117,7 +117,7 @@ class Trainer:
                 raise ValueError(f"weights of another network: {', '.join(unexpected[:3])}")
 
     @torch.no_grad()
-    def answer(self, image: Floats32) -> dict[str, Floats32]:
+    def raw_outputs(self, image: Floats32) -> dict[str, Floats32]:
         """Outputs by name of the averaged network for images (B, 3, H, W) in [-1, 1]."""
         self.average.eval()
         with torch.autocast("cpu", torch.bfloat16, enabled=self.half):
