@@ -91,7 +91,7 @@ def test_growing_age_is_named() -> None:
     assert said.startswith("age at the planner, first quarter p50 21.5, p99 40.0 ms; last 21.5, 40.0 ms; p50 +0.0 +-")
     assert bad == []
     said, bad = ages(Ages(t_s, [20.0 + 0.05 * k for k in range(400)]))
-    assert bad == ["the age grew from 22.5 to 37.5 ms in the median"]
+    assert bad == ["the median age grew from 22.5 to 37.5 ms"]
     assert "p50 +6000.0 +- 0.0 ms an hour" in said  # 0.05 ms in 0.03 s
 
 
