@@ -167,13 +167,13 @@ def test_both_kinds_of_file_are_read(tmp_path: Path) -> None:
     [
         ("", "has 0 poses"),
         ("0.0 0 0 0 0 0 0 1\n", "has 1 poses"),
-        ("0.0 0 0 0 0 0 0 1\n0.1 0 0 0 0 0 0\n", "line 2 is no TUM pose"),
-        ("0.0 0 0 0 0 0 0 1\n0.1 nan 0 0 0 0 0 1\n", "line 2 is no TUM pose"),
+        ("0.0 0 0 0 0 0 0 1\n0.1 0 0 0 0 0 0\n", "line 2 is not a TUM pose"),
+        ("0.0 0 0 0 0 0 0 1\n0.1 nan 0 0 0 0 0 1\n", "line 2 is not a TUM pose"),
         ("0.0 0 0 0 0 0 0 1\n0.1 0 0 0 1 1 0 1\n", "no unit quaternion"),
         ("0.1 0 0 0 0 0 0 1\n0.1 0 0 0 0 0 0 1\n", "pose 1 is not later"),
         ("1e18 0 0 0 0 0 0 1\n2e18 0 0 0 0 0 0 1\n", "not in seconds"),
-        ("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 0 0 1 0 0 0 0\n", "line 2 is no KITTI pose"),
-        ("time,x,y\n", "line 1 is no TUM pose"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 0 0 1 0 0 0 0\n", "line 2 is not a KITTI pose"),
+        ("time,x,y\n", "line 1 is not a TUM pose"),
     ],
 )
 def test_a_malformed_file_is_an_error_with_its_line(tmp_path: Path, text: str, says: str) -> None:

@@ -73,7 +73,7 @@ def test_detections_by_frame_best_first(tmp_path: Path) -> None:
         ("label_02/0002.txt", "0 1 Car 0 0 x 1 1 2 2 1 1 1 1 1 1 1\n", "line 1 is not a label"),
         ("label_02/0002.txt", "0 1 Car 0 0 nan 1 1 2 2 1 1 1 1 1 1 1\n", "line 1 has invalid numbers"),
         ("label_02/0002.txt", "99 1 Car 0 0 0 1 1 2 2 1 1 1 1 1 1 1\n", "40 poses, but its labels end at frame 99"),
-        ("pose_cam0/0002.txt", "1 0 0\n", "line 1 is no KITTI pose"),
+        ("pose_cam0/0002.txt", "1 0 0\n", "line 1 is not a KITTI pose"),
         ("pose_cam0/0002.txt", "", "has no poses"),
         ("calib/0002.txt", "P0: 1\n", "has no P2"),
         ("oxts/0002.txt", "1 2 3\n", "line 1 is not a GPS/IMU reading of 30"),
