@@ -225,7 +225,7 @@ class FakeBus:
     def __init__(self) -> None:
         self.inboxes: dict[str, Inbox] = {}
 
-    def subscriber(self, topic: str, depth: int | None = None) -> Inbox:
+    def subscriber(self, topic: str, depth: int | None = None, may_drop: bool = False) -> Inbox:
         return self.inboxes.setdefault(topic, Inbox())
 
 
