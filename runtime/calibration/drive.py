@@ -39,6 +39,7 @@ from birdslam.types import Frame
 # For a first pass: the run that follows estimates the tilt again
 ROUGH = CalibrationConfig(max_sigma_rad=0.05, max_sigma_roll_rad=0.1)
 LEVEL_SIGMA_RAD = 0.035  # prior of pitch and roll: two degrees, by judgement
+TILT_HZ = 12.0  # least frame rate of the passes for the tilt: a higher one adds correlated alignments of the road
 
 
 class Calibrated(NamedTuple):
@@ -74,7 +75,7 @@ def calibrate_drive(
         lens, corners, k1_sigma, pitch = lens_of_drive(configuration, uri, given, size, stride, must_show)
     if lens is not None and size is not None:
         lens = lens.for_size(*size)
-    recording = _open(uri, lens, height_m, stride, topics)
+    recording, every = _open_slowly(uri, lens, height_m, stride, topics)
     if pitch is not None:
         recording.camera = msgspec.structs.replace(recording.camera, pitch_rad=pitch.pitch_rad)
     readout: Readout | None = None
@@ -83,6 +84,7 @@ def calibrate_drive(
         corners = corners or corners_of_drive(configuration, uri, recording.camera, stride)
         readout = readout_of_drive(corners, recording.camera, focal_sigma_rel(lens), k1_sigma)
         recording.camera = msgspec.structs.replace(recording.camera, readout_s=readout.readout_s)
+    most_frames = None if configuration.source.frames is None else max(1, configuration.source.frames // every)
     known_height = height_m is not None or lens is None  # a recording with its own calibration has the height
     cv2.setNumThreads(configuration.perceive.opencv_threads)
     configuration = configuration.as_lossless()
@@ -90,7 +92,7 @@ def calibrate_drive(
     with Inference(configuration) as inference:
 
         def drive() -> Iterator[tuple[Frame, Pending]]:
-            frames = read_pieces(recording, pieces(recording, configuration.source.frames), "calibrate")
+            frames = read_pieces(recording, pieces(recording, most_frames), "calibrate")
             return inference.networks.in_order(frames)
 
         try:
@@ -127,6 +129,15 @@ def _assumed(camera: Camera, pitch: TravelPitch | None, why: str) -> Calibration
         speed_mps=0.0,
         assumed=f"pitch from the direction of travel, no roll: {why}" if pitch else f"a level camera: {why}",
     )
+
+
+def _open_slowly(
+    uri: str, lens: Intrinsics | None, height_m: float | None, stride: int, topics: BagTopics
+) -> tuple[Recording, int]:
+    """Opens the recording at a frame rate of TILT_HZ or a little more; also returns the factor on the stride."""
+    recording = _open(uri, lens, height_m, stride, topics)
+    every = max(1, int(recording.rate_hz / TILT_HZ))
+    return (recording if every == 1 else _open(uri, lens, height_m, stride * every, topics)), every
 
 
 def _open(uri: str, lens: Intrinsics | None, height_m: float | None, stride: int, topics: BagTopics) -> Recording:
