@@ -61,6 +61,7 @@ class SideBySide:
         self._image_px = (round(camera.width_px * self._scale), round(camera.height_px * self._scale))
         self.size_px = self._image_px[0] + PANEL_PX, self._image_px[1] + STRIP_PX  # width, height; both even
         self.size_px = self.size_px[0] // 2 * 2, self.size_px[1] // 2 * 2
+        self._paper: Image = np.full((self.size_px[1], self.size_px[0], 3), _bgr(PAPER), np.uint8)
         self._per_m = self.size_px[1] / (AHEAD_M + BEHIND_M)
         self._epoch: int | None = None
         self._lanes: deque[tuple[float, float]] = deque(maxlen=MAX_POINTS)
@@ -80,7 +81,7 @@ class SideBySide:
         """
         self._enter(estimate.epoch)
         self._path.append((estimate.T_world_ego.x_m, estimate.T_world_ego.y_m))
-        canvas = np.full((self.size_px[1], self.size_px[0], 3), _bgr(PAPER), np.uint8)
+        canvas = self._paper.copy()
         width_px, height_px = self._image_px
         canvas[:height_px, :width_px] = self._camera_view(image, estimate)
         for line, text in enumerate(words):
@@ -121,7 +122,7 @@ class SideBySide:
             in_front = np.zeros(view.shape[:2], np.uint8)  # road users hide the lanes behind them
             for _, _, px in solids:
                 cv2.fillConvexPoly(in_front, cv2.convexHull(_fixed(px)), 1, cv2.LINE_8, SHIFT)
-            np.copyto(view, before, where=in_front[:, :, None] > 0)
+            cv2.copyTo(before, in_front, view)
         for vehicle, foot, px in solids:
             low, high = _fixed(px[:4]), _fixed(px[4:])
             colour = _colour_of(vehicle)
@@ -150,7 +151,7 @@ class SideBySide:
             cv2.polylines(view, [_fixed(px)], False, colour, 2, cv2.LINE_AA, SHIFT)
 
     def _from_above(self, estimate: Estimate, true_outlines: Sequence[Floats]) -> Image:
-        panel = np.full((self.size_px[1], PANEL_PX, 3), _bgr(PAPER), np.uint8)
+        panel = self._paper[:, :PANEL_PX].copy()
         T_ego_world = estimate.T_world_ego.inverse()
         origin = self._panel_px(np.zeros((1, 2)))[0]
         for ring in range(1, int(AHEAD_M / RING_M) + 1):
@@ -212,7 +213,7 @@ class DriveVideo:
         truth: Callable[[int], Sequence[Floats]] | None = None,
     ) -> None:
         self._view = SideBySide(camera)
-        self._every = math.ceil(rate_hz / MAX_VIDEO_RATE_HZ)
+        self._every = frames_per_picture(rate_hz)
         self._frames, self._truth = frames, truth
         self._next: tuple[int, int, Image | None] | None = None
         self._estimate: Estimate | None = None
@@ -262,6 +263,11 @@ class DriveVideo:
 
     def __exit__(self, *failure: object) -> None:
         self._writer.release()
+
+
+def frames_per_picture(rate_hz: float) -> int:
+    """Returns how many frames of a camera a picture of its video stands for."""
+    return math.ceil(rate_hz / MAX_VIDEO_RATE_HZ)
 
 
 def check_video(path: Path, camera: Camera, rate_hz: float) -> None:

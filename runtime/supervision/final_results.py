@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from birdslam.geometry.camera import Camera, Undistorter
 from birdslam.loops.gnss.earth import EarthError
 from birdslam.loops.gnss.files import GnssError
 from birdslam.outputs.drive_files import ResultsError, claim_directory
-from birdslam.outputs.drive_video import CODEC, DriveVideo, check_video
+from birdslam.outputs.drive_video import CODEC, DriveVideo, check_video, frames_per_picture
 from birdslam.outputs.final_trajectories import FinalTracks, last_seen, write_final_ego
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.maps.drive_earth import rows as earth_rows
@@ -124,7 +125,8 @@ class FinalResults:
             camera, rate_hz, frames = recorded_frames(files)
         else:
             source = open_source(self._config)
-            camera, rate_hz, frames = source.camera, source.rate_hz, source_frames(source)
+            camera, rate_hz = source.camera, source.rate_hz
+            frames = source_frames(source, frames_per_picture(rate_hz))
         draw_video(path, camera, rate_hz, frames, records, _last_frame(files, self._demo), truth)
 
 
@@ -159,7 +161,10 @@ def draw_video(
     truth: Callable[[int], Sequence[Floats]] | None = None,
 ) -> None:
     """Draws a whole drive. Raises ResultsError if the file can't be written."""
-    with Progress("video", last_frame) as progress, DriveVideo(path, camera, rate_hz, frames, truth) as video:
+    with (
+        Progress("video", last_frame) as progress,
+        DriveVideo(path, camera, rate_hz, _read_ahead(frames), truth) as video,
+    ):
         for record in records:
             if isinstance(record, Estimate):
                 video.add(record)
@@ -169,12 +174,21 @@ def draw_video(
         video.finish()
 
 
-def source_frames(source: Source) -> Frames:
-    """Yields the frames of a recording, numbered as in capture."""
-    undistort = Undistorter(source.camera)
+def _read_ahead(frames: Frames) -> Frames:
+    """Reads the next frame in a thread while the caller draws one."""
+    with ThreadPoolExecutor(1) as thread:
+        coming = thread.submit(next, frames, None)
+        while (frame := coming.result()) is not None:
+            coming = thread.submit(next, frames, None)
+            yield frame
+
+
+def source_frames(source: Source, every: int = 1) -> Frames:
+    """Yields the frames of a recording, numbered as in capture; only each `every`-th with its image."""
+    undistort, camera = Undistorter(source.camera), source.camera
     for frame_id, recorded in enumerate(source.frames()):
-        image = recorded.image
-        fits = image is not None and image.shape[1::-1] == (source.camera.width_px, source.camera.height_px)
+        image = recorded.image if frame_id % every == 0 else None
+        fits = image is not None and image.shape[1::-1] == (camera.width_px, camera.height_px)
         yield frame_id, recorded.t_source_ns, undistort(image) if image is not None and fits else None
 
 
