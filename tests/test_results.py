@@ -136,7 +136,8 @@ def test_row_k_is_frame_k_whatever_was_dropped_or_unreadable(tmp_path: Path) -> 
     recorder.finish({})
     z_m = read_kitti(tmp_path / "ego.kitti.txt")[:, 2, 3]
     assert z_m == pytest.approx(np.array([0.0, 1.0, 1.0, 1.0, 1.0, 5.0]) * math.cos(0.01), abs=1e-8)
-    assert len(read_tum(tmp_path / "ego.tum.txt")[0]) == 4  # gaps in times are not filled
+    assert len(read_tum(tmp_path / "ego.tum.txt")[0]) == 3  # gaps in times are not filled
+    assert "# not valid: 0.060000000 1.000000000 " in (tmp_path / "ego.tum.txt").read_text()
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["statuses"] == {"frame_unreadable": 1, "frames_dropped": 1}
     assert summary["invalid_frames"] == 1

@@ -33,7 +33,7 @@ FRAME_COLUMNS = ("frame", "t_s", "epoch", "x_m", "y_m", "yaw_rad", "speed_mps", 
 FILES = {  # descriptions for README.txt
     "summary.json": "all counts, the configuration and the versions",
     "bev.png": "the drive from above",
-    "ego.tum.txt": "the trajectory of the car: time, position and attitude of each frame, in metres",
+    "ego.tum.txt": "the trajectory of the car: time, position and attitude of each valid frame, in metres",
     "frames.csv": "position, speed, scale sigma, validity and statuses of each frame",
     "report.html": "a page with all results, for any browser",
     "ego.kitti.txt": "the camera poses in KITTI format",
@@ -151,7 +151,8 @@ class Recorder:
         self._ends_unreadable = Status.FRAME_UNREADABLE in estimate.status
         self._table.write(self._frame_row(estimate) + "\n")
         pose = ego_pose(estimate.T_world_ego, estimate.attitude)
-        self._tum.write(tum_row(estimate.t_source_ns, self._ego.add(estimate.epoch, pose)) + "\n")
+        row = tum_row(estimate.t_source_ns, self._ego.add(estimate.epoch, pose))
+        self._tum.write(f"{row}\n" if estimate.valid else f"# not valid: {row}\n")
         self._write_row(estimate, pose)
         self._scene.add(estimate)
         self._lines.add(estimate, self._scene.T_picture_world)
