@@ -215,7 +215,7 @@ def test_errors_that_last_are_not_averaged_away() -> None:
     assert_graph_is_honest("constant velocity", world, seeds=100)
     independent = GraphConfig(lasting_share=0.0)
     drawn = replace(world, traffic="drawn")
-    found = [nees(drive(drawn, seed), independent, WeightsConfig()) for seed in range(60)]
+    found = [nees(drive(drawn, seed), independent, WeightsConfig()) for seed in range(30)]
     assert np.mean([of["vehicle"] for of in found if "vehicle" in of]) > 1.5 * 3
 
 

@@ -58,6 +58,7 @@ def check_starts(rows: list[Row], max_wrong_ratio: float) -> None:
     assert np.median(scale_errors(rows)) <= 0.05
 
 
+@pytest.mark.slow
 def test_cold_starts_on_roads_have_the_right_scale() -> None:
     """Of 18 starts: median error 0.8 to 1.1 %, 88 to 89 % valid, 0 or 1 of 414 motions wrong while valid."""
     check_starts([measure(read(DemoRecording(directory=CLIPS / name)), (0, 2, 4)) for name in NAMES], 0.01)
