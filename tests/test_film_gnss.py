@@ -11,6 +11,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.gnss.earth import EarthError
@@ -18,7 +20,7 @@ from birdslam.loops.gnss.files import GnssError, read_fixes
 from birdslam.outputs.earth_files import GeoLine, write_geo_lines
 from birdslam.runtime.cli.main import main
 from birdslam.runtime.configuration import FILM, load
-from birdslam.runtime.maps.film_gnss import FilmFix, read_film, track_of_films
+from birdslam.runtime.maps.film_gnss import FilmFix, fixes_beside, read_film, track_of_films
 from birdslam.runtime.supervision.final_results import GNSS_UNUSED, FinalResults
 from birdslam.sources.speed_file import read_speeds
 from tests.test_results import estimate
@@ -181,6 +183,52 @@ def test_fixes_without_a_date_have_the_times_of_their_film(tmp_path: Path) -> No
     undated(tmp_path / "film2.mp4")
     with pytest.raises(GnssError, match="have no date"):
         track_of_films([path, tmp_path / "film2.mp4"], track)
+
+
+def cue(k: int, text: str) -> str:
+    return f"{k + 1}\n00:00:{k // 2:02d},{500 * (k % 2):03d} --> 00:00:{k // 2 + 1:02d},000\n{text}\n"
+
+
+SUBTITLES = {
+    "DJI": "<font>FrameCnt: 1, iso: 100 [latitude: {lat:.6f}] [longitude: {lon:.6f}] [rel_alt: 1.3]</font>",
+    "DJI before 2018": "HOME(1.0,2.0) GPS({lon:.6f},{lat:.6f},15) BAROMETER:1.2",
+    "dashcam": "N{lat:.6f} W{west:.6f} 34 km/h",
+    "dashcam, hemisphere last": "{lat:.6f}\u00b0 N, {west:.6f}\u00b0 W",
+}
+
+
+@pytest.mark.parametrize("form", SUBTITLES)
+def test_subtitles_beside_a_film_are_read_without_exiftool(
+    form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two cues a second from a receiver of one fix a second: the repeated positions are dropped."""
+    monkeypatch.setenv("PATH", str(tmp_path))
+    film(tmp_path / "film.mp4")
+    fixes = [(fix.latitude_deg, fix.longitude_deg) for fix in FIXES for _ in range(2)]
+    cues = [cue(k, SUBTITLES[form].format(lat=lat, lon=lon, west=-lon)) for k, (lat, lon) in enumerate(fixes)]
+    (tmp_path / "film.srt").write_text("\n".join(cues), encoding="utf-8-sig")
+    assert track_of_films([tmp_path / "film.mp4"], tmp_path / "film.gpx") == len(FIXES)
+    of_film = read_fixes((tmp_path / "film.gpx").read_bytes(), "film.gpx", 0)
+    of_subtitles = read_fixes((tmp_path / "film.srt").read_bytes(), "film.srt", 0)
+    for found in (of_film, of_subtitles):
+        assert [fix.t_source_ns for fix in found] == [k * 1_000_000_000 for k in range(len(FIXES))]
+        degrees = [(fix.latitude_deg, fix.longitude_deg) for fix in found]
+        assert degrees == pytest.approx(np.array(fixes[::2]), abs=1e-6)
+
+
+def test_subtitles_without_positions_are_no_track(tmp_path: Path) -> None:
+    (tmp_path / "film.srt").write_text(cue(0, "Latitude is a band.") + "\n" + cue(1, "N. 12 E. 4"))
+    assert fixes_beside(tmp_path / "film.mp4") == []
+    with pytest.raises(GnssError, match="has no fix"):
+        read_fixes((tmp_path / "film.srt").read_bytes(), "film.srt", 0)
+
+
+@given(st.text(max_size=200))
+def test_any_subtitle_text_gives_fixes_or_an_error(text: str) -> None:
+    try:
+        assert all(abs(fix.latitude_deg) <= 90.0 for fix in read_fixes(cue(0, text).encode(), "film.srt", 0))
+    except GnssError as error:
+        assert str(error).startswith("film.srt")
 
 
 @exiftool

@@ -1,7 +1,7 @@
-"""GNSS tracks inside films, read by ExifTool: GoPro, Novatek (Viofo and others), BlackVue, Garmin and more.
+"""GNSS tracks of films: in subtitles beside the film (FILM.srt), or inside it as GoPro, Novatek and others write them.
 
-ExifTool is a program of its own (Debian: libimage-exiftool-perl). Fixes become a GPX track beside the results, which
-`--gnss` and `--speed` read like any other.
+ExifTool, a program of its own (Debian: libimage-exiftool-perl), reads those inside. Fixes become a GPX track beside the
+results, which `--gnss` and `--speed` read like any other.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ import msgspec
 import numpy as np
 
 from birdslam.loops.gnss.earth import is_on_earth
-from birdslam.loops.gnss.files import GnssError
+from birdslam.loops.gnss.files import MAX_BYTES, GnssError
+from birdslam.loops.gnss.subtitles import subtitle_fixes
 from birdslam.outputs.earth_files import GeoLine, write_geo_lines
 from birdslam.types import NS_PER_S
 
@@ -77,7 +78,7 @@ def track_of_films(films: Sequence[Path], path: Path) -> int:
 
     Speeds are left out, since their unit differs between cameras. Raises GnssError.
     """
-    fixes = [fix for film in films for fix in read_film(film)]
+    fixes = [fix for film in films for fix in fixes_beside(film) or read_film(film)]
     if len(films) > 1 and any(fix.utc is None for fix in fixes):
         raise GnssError(f"{films[0].parent}: the fixes inside the films have no date, so their order is unknown")
     if len(fixes) < 2:
@@ -90,6 +91,19 @@ def track_of_films(films: Sequence[Path], path: Path) -> int:
     except OSError as error:
         raise GnssError(f"{path}: can't be written: {error.strerror}") from None
     return len(fixes)
+
+
+def fixes_beside(film: Path) -> list[FilmFix]:
+    """Reads the fixes in the subtitles beside a film, FILM.srt. Raises GnssError."""
+    path = next((path for suffix in (".srt", ".SRT") if (path := film.with_suffix(suffix)).is_file()), None)
+    if path is None:
+        return []
+    try:
+        text = path.read_bytes()[:MAX_BYTES].decode("utf-8-sig", errors="replace")
+    except OSError as error:
+        raise GnssError(f"{path}: can't be read: {error.strerror}") from None
+    fixes = (FilmFix(latitude, longitude, None, t_s) for _, (t_s, latitude, longitude, *_) in subtitle_fixes(text))
+    return [fix for fix in fixes if is_on_earth(fix.latitude_deg, fix.longitude_deg) and fix.latitude_deg]
 
 
 def _fix(sample: dict[str, Any]) -> FilmFix | None:

@@ -1,6 +1,6 @@
-"""GNSS fixes from files: CSV with named columns, NMEA 0183 sentences, GPX tracks. The input is not trusted.
+"""GNSS fixes from files: CSV with named columns, NMEA 0183 sentences, GPX tracks, subtitles. The input is not trusted.
 
-The times of a CSV are seconds of the recording's clock, or Unix time; NMEA and GPX have UTC. UTC is the recording's own
+The times of a CSV are seconds of the recording's clock, or Unix time; NMEA and GPX have UTC, subtitles that of a film. UTC is the recording's own
 clock where it begins within a day of the fixes. Else the clocks are unrelated, and the first fix gets the time of the
 first frame: `Track.clock_is_known` is false.
 """
@@ -17,6 +17,7 @@ from xml.etree import ElementTree
 
 from birdslam.loops.gnss.earth import DEFAULT_SIGMA_M, GnssFix, is_on_earth
 from birdslam.loops.gnss.sentences import SIGMA_PER_HDOP_M, NmeaReader, Sentence, undated_fixes
+from birdslam.loops.gnss.subtitles import is_subtitles, subtitle_fixes
 from birdslam.types import NS_PER_S
 
 MAX_BYTES, MAX_FIXES = 1 << 26, 1_000_000
@@ -69,6 +70,8 @@ def read_track(data: bytes, name: str, begin_ns: int, offset_s: float | None = N
         fixes, utc = _gpx(text, name), True
     elif _SENTENCE.search("\n".join(text.splitlines()[:NMEA_LINES])):
         fixes, utc = _nmea(text, name, begin_ns), True
+    elif is_subtitles(text):
+        fixes, utc = [_checked(f"{name}: cue", number, *fix) for number, fix in subtitle_fixes(text)], False
     else:
         fixes = _csv(text, name)
         utc = bool(fixes) and fixes[0][0] >= UNIX_FROM_S

@@ -99,11 +99,14 @@ def _with_film_gnss(configuration: Configuration) -> tuple[Configuration, Path |
     scheme, _, address = source.uri.partition(":")
     if scheme != VIDEO.name and is_named:
         raise ConfigurationError(f"--gnss film, --speed film: the source is no film: {source.uri}")
-    if scheme != VIDEO.name or not (is_named or (not results.gnss and film_gnss.is_readable())):
+    if scheme != VIDEO.name or (results.gnss and not is_named):
         return configuration, None
     track = Path(configuration.output) / film_gnss.TRACK_FILE
     try:
-        count = film_gnss.track_of_films(films_in(Path(address).expanduser(), VIDEO.suffixes), track)
+        films = films_in(Path(address).expanduser(), VIDEO.suffixes)
+        if not (is_named or film_gnss.is_readable() or any(map(film_gnss.fixes_beside, films))):
+            return configuration, None
+        count = film_gnss.track_of_films(films, track)
     except GnssError as error:
         if is_named:
             raise
@@ -113,7 +116,7 @@ def _with_film_gnss(configuration: Configuration) -> tuple[Configuration, Path |
         raise ConfigurationError(f"--gnss film, --speed film: {address}: has no GNSS track")
     if not count:
         return configuration, None
-    print(f"{count} GNSS fixes inside the film: {track}", flush=True)
+    print(f"{count} GNSS fixes of the film: {track}", flush=True)
     if source.speed == FILM:
         source = msgspec.structs.replace(source, speed=str(track))
     if results.gnss == FILM:
