@@ -226,9 +226,10 @@ def test_subtitles_without_positions_are_no_track(tmp_path: Path) -> None:
 @given(st.text(max_size=200))
 def test_any_subtitle_text_gives_fixes_or_an_error(text: str) -> None:
     try:
-        assert all(abs(fix.latitude_deg) <= 90.0 for fix in read_fixes(cue(0, text).encode(), "film.srt", 0))
-    except GnssError as error:
-        assert str(error).startswith("film.srt")
+        fixes = read_fixes(cue(0, text).encode(), "film.srt", 0)
+    except GnssError:
+        fixes = []
+    assert all(abs(fix.latitude_deg) <= 90.0 for fix in fixes)
 
 
 @exiftool
