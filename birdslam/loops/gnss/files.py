@@ -1,8 +1,8 @@
 """GNSS fixes from files: CSV with named columns, NMEA 0183 sentences, GPX tracks, subtitles. The input is not trusted.
 
-The times of a CSV are seconds of the recording's clock, or Unix time; NMEA and GPX have UTC, subtitles that of a film. UTC is the recording's own
-clock where it begins within a day of the fixes. Else the clocks are unrelated, and the first fix gets the time of the
-first frame: `Track.clock_is_known` is false.
+The times of a CSV are seconds of the recording's clock, or Unix time; NMEA and GPX have UTC, subtitles the time of
+their film. UTC is the recording's own clock where it begins within a day of the fixes. Else the clocks are unrelated,
+and the first fix gets the time of the first frame: `Track.clock_is_known` is false.
 """
 
 from __future__ import annotations
