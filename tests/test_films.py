@@ -258,13 +258,19 @@ def test_non_film_file_is_a_one_line_error(tmp_path: Path, capfd: pytest.Capture
 def test_a_phones_metadata_state_the_focal_length(suffix: str, tmp_path: Path) -> None:
     path = film(tmp_path / f"phone.{suffix}", range(0, 200, 40), metadata={FOCAL_KEY: "26", "title": "a drive"})
     assert VideoRecording.stated_focal_px(path) == pytest.approx(WIDTH * 26 / 36)
-    known = focal_length_of(Given(), f"video:{path}", WIDTH)
+    known = focal_length_of(Given(), f"video:{path}", (WIDTH, HEIGHT))
     assert (known.px, known.sigma_rel) == (pytest.approx(WIDTH * 26 / 36), METADATA_SIGMA_REL)
     assert "metadata" in known.by
-    assert "as stated, 60 deg" in focal_length_of(Given(fov_deg=60.0), f"video:{path}", WIDTH)[2]  # goes before it
+    assert "as stated, 60 deg" in focal_length_of(Given(fov_deg=60.0), f"video:{path}", (WIDTH, HEIGHT))[2]  # goes before it
     without = film(tmp_path / f"other.{suffix}", range(0, 200, 40))
     assert VideoRecording.stated_focal_px(without) is None
-    assert "that of a phone" in focal_length_of(Given(kind="phone"), f"video:{without}", WIDTH)[2]
+    assert "that of a phone" in focal_length_of(Given(kind="phone"), f"video:{without}", (WIDTH, HEIGHT))[2]
+
+
+@pytest.mark.parametrize("kind", ["phone", "dashcam"])
+def test_an_upright_camera_has_the_focal_length_of_a_level_one(kind: str) -> None:
+    level, upright = (focal_length_of(Given(kind=kind), "video:film.mp4", size) for size in ((1920, 1080), (1080, 1920)))
+    assert level == upright
 
 
 @settings(max_examples=60)

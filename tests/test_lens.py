@@ -106,7 +106,7 @@ def test_a_wide_lens_is_about_equidistant() -> None:
     assert wide.fisheye
     assert wide.k1 == pytest.approx(0.0, abs=3.0 * wide.k1_sigma)
     assert wide.k1_sigma < 0.1
-    given = focal_length_of(Given(fov_deg=140.0), "video:film.mp4", 960)
+    given = focal_length_of(Given(fov_deg=140.0), "video:film.mp4", (960, 540))
     assert given.fisheye
     Camera(960, 540, given.px, given.px, 479.5, 269.5, height_m=1.4)  # a pinhole's is refused
 

@@ -113,7 +113,7 @@ def self_calibrate(
     prior = FocalPrior(math.log(focal_px), focal_sigma_rel)
     turned_rad, sigmas = _total_rotation_rad(fitted), estimate_sigmas(fitted, prior)
     if by_view:
-        k1_sigma, edge2 = min(float(sigmas[0]), k1_prior[1]), (0.5 * size_px[0] / focal_px) ** 2
+        k1_sigma, edge2 = min(float(sigmas[0]), k1_prior[1]), (0.5 * max(size_px) / focal_px) ** 2
         distorts = math.log(max(1.0 + fitted.k1 * edge2, 0.3))
         focal_sigma_rel = math.hypot(focal_sigma_rel, distorts, k1_sigma * edge2)
         prior = FocalPrior(math.log(focal_px), focal_sigma_rel)

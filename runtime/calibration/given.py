@@ -86,8 +86,12 @@ class FocalLength(NamedTuple):
     fisheye: bool = False  # about equidistant: too wide for a pinhole model
 
 
-def focal_length_of(given: Given, uri: str, width_px: int) -> FocalLength:
-    """Returns the focal length as stated, from metadata, or from the kind of camera. Raises ConfigurationError."""
+def focal_length_of(given: Given, uri: str, size_px: tuple[int, int]) -> FocalLength:
+    """Returns the focal length as stated, from metadata, or from the kind of camera. Raises ConfigurationError.
+
+    The field of view of a kind is that across the longer side of the image: phones are also held upright.
+    """
+    width_px = size_px[0]
     if given.fov_deg is not None:
         if not 10.0 <= given.fov_deg <= 150.0:
             raise ConfigurationError(f"--fov {given.fov_deg:g}: expected a field of view of 10 to 150 deg")
@@ -100,7 +104,7 @@ def focal_length_of(given: Given, uri: str, width_px: int) -> FocalLength:
         by = f"from the video's metadata, {stated_px:.0f} px"
         return FocalLength(stated_px, METADATA_SIGMA_REL, by, by_view=False)
     fov_deg, sigma_rel = FIELD_OF_VIEW_DEG[given.kind]
-    focal_px = focal_by_field_of_view(width_px, fov_deg)
+    focal_px = focal_by_field_of_view(max(size_px), fov_deg)
     return FocalLength(focal_px, sigma_rel, f"that of a {given.kind}, {fov_deg:g} deg across")
 
 

@@ -49,7 +49,7 @@ def lens_of_drive(
     Raises CalibrationError if they do not determine it; without `must_show` it then returns the prior.
     """
     width_px, height_px = size_px
-    known = focal_length_of(given, uri, width_px)
+    known = focal_length_of(given, uri, size_px)
     focal_px = known.px
     middle = 0.5 * (width_px - 1.0), 0.5 * (height_px - 1.0)
     camera = Camera(width_px, height_px, focal_px, focal_px, *middle, height_m=given.height_m or UNKNOWN_HEIGHT_M)
