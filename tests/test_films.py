@@ -254,6 +254,21 @@ def test_non_film_file_is_a_one_line_error(tmp_path: Path, capfd: pytest.Capture
         assert told.err.count("\n") == 1, told.err  # neither FFmpeg's words nor OpenCV's
 
 
+@pytest.mark.parametrize("suffix", ["mkv", "webm"])
+def test_a_recording_cut_off_before_its_length_was_written_is_read_to_its_end(suffix: str, tmp_path: Path) -> None:
+    """As OBS and live streams leave them: no duration, segment of unknown size."""
+    codec = "libvpx" if suffix == "webm" else "libx264"
+    path = film(tmp_path / f"live.{suffix}", range(0, 400, 40), codec)
+    data = bytearray(path.read_bytes())
+    segment, duration = data.index(b"\x18\x53\x80\x67") + 4, data.index(b"\x44\x89\x88")
+    data[segment : segment + 8] = b"\x01" + 7 * b"\xff"
+    data[duration : duration + 11] = b"\xec\x89" + 9 * b"\0"  # EBML Void
+    path.write_bytes(data)
+    recording = VideoRecording(path, CAMERA)
+    assert len(recording) == 0  # unknown
+    assert [frame.image is not None for frame in recording.frames()] == [True] * 10
+
+
 @pytest.mark.parametrize("suffix", ["mp4", "mov"])
 def test_a_phones_metadata_state_the_focal_length(suffix: str, tmp_path: Path) -> None:
     path = film(tmp_path / f"phone.{suffix}", range(0, 200, 40), metadata={FOCAL_KEY: "26", "title": "a drive"})
@@ -261,7 +276,9 @@ def test_a_phones_metadata_state_the_focal_length(suffix: str, tmp_path: Path) -
     known = focal_length_of(Given(), f"video:{path}", (WIDTH, HEIGHT))
     assert (known.px, known.sigma_rel) == (pytest.approx(WIDTH * 26 / 36), METADATA_SIGMA_REL)
     assert "metadata" in known.by
-    assert "as stated, 60 deg" in focal_length_of(Given(fov_deg=60.0), f"video:{path}", (WIDTH, HEIGHT))[2]  # goes before it
+    assert (
+        "as stated, 60 deg" in focal_length_of(Given(fov_deg=60.0), f"video:{path}", (WIDTH, HEIGHT))[2]
+    )  # goes before it
     without = film(tmp_path / f"other.{suffix}", range(0, 200, 40))
     assert VideoRecording.stated_focal_px(without) is None
     assert "that of a phone" in focal_length_of(Given(kind="phone"), f"video:{without}", (WIDTH, HEIGHT))[2]
@@ -269,7 +286,9 @@ def test_a_phones_metadata_state_the_focal_length(suffix: str, tmp_path: Path) -
 
 @pytest.mark.parametrize("kind", ["phone", "dashcam"])
 def test_an_upright_camera_has_the_focal_length_of_a_level_one(kind: str) -> None:
-    level, upright = (focal_length_of(Given(kind=kind), "video:film.mp4", size) for size in ((1920, 1080), (1080, 1920)))
+    level, upright = (
+        focal_length_of(Given(kind=kind), "video:film.mp4", size) for size in ((1920, 1080), (1080, 1920))
+    )
     assert level == upright
 
 

@@ -19,7 +19,7 @@ from birdslam.bench.ego.trajectory_errors import evaluate_recordings
 from birdslam.geometry.camera import AXES_EGO_CAM, Camera, GroundPlane, Undistorter
 from birdslam.geometry.se2 import SE2
 from birdslam.ros.bag import BagTopics
-from birdslam.ros.sensor import lens, pixels
+from birdslam.ros.sensor import demosaiced, lens, pixels
 from birdslam.runtime.calibration.given import Given, lens_of
 from birdslam.runtime.configuration import load
 from birdslam.runtime.nodes.sources import open_source
@@ -121,6 +121,18 @@ def test_uniform_bayer_image_is_uniform(pattern: str) -> None:
     assert (image[4:-4, 4:-4] == (30, 100, 200)).all()
 
 
+@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
+def test_a_bayer_mosaic_in_a_jpeg_equals_the_raw_one(pattern: str) -> None:
+    colour = {"r": 200, "g": 100, "b": 30}
+    mosaic = np.tile(np.array([colour[c] for c in pattern], np.uint8).reshape(2, 2), (HEIGHT // 2, WIDTH // 2))
+    raw = pixels(ros.image(mosaic, 0, f"bayer_{pattern}8"))
+    assert np.array_equal(demosaiced(f"bayer_{pattern}8; png compressed ", mosaic), raw)
+    assert demosaiced(f"bayer_{pattern}8; jpeg compressed bgr8", raw) is raw  # the driver has made it BGR
+    assert demosaiced("mono8; jpeg compressed mono8", mosaic) is mosaic
+    with pytest.raises(ValueError, match="bayer_rggb16"):
+        demosaiced("bayer_rggb16; png compressed ", mosaic)
+
+
 @pytest.mark.parametrize(("encoding", "luma"), [("yuv422", 1), ("uyvy", 1), ("yuyv", 0), ("yuv422_yuy2", 0)])
 def test_yuv_without_colour_is_grey(encoding: str, luma: int) -> None:
     stored = np.full((HEIGHT, WIDTH, 2), 128, np.uint8)
@@ -167,6 +179,7 @@ def test_compressed_images(tmp_path: Path) -> None:
     [
         (ros.camera_info(*INFO, "plumb_bob", (-0.3, 0.1, 0.001, 0.002, 0.0)), False, (50.0, 31.0, 5, False)),
         (ros.camera_info(*INFO, "rational_polynomial", (0.1,) * 8), False, (50.0, 31.0, 8, False)),
+        *((ros.camera_info(*INFO, "plumb_bob", (0.1,) * n), False, (50.0, 31.0, n, False)) for n in (4, 8, 12, 14)),
         (ros.camera_info(*INFO, "equidistant", (0.0,) * 4), False, (50.0, 31.0, 4, True)),
         (ros.camera_info(*INFO, "plumb_bob", (-0.3,) * 5, rectified=(45, 46, 30, 15)), True, (45.0, 30.0, 0, False)),
         (ros.camera_info(*INFO, binning=2), False, (25.0, 15.5, 0, False)),

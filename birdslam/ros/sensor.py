@@ -39,7 +39,8 @@ ENCODINGS: dict[str, tuple[int, int | None]] = {
     "yuv422_yuy2": (2, cv2.COLOR_YUV2BGR_YUY2),
     "yuyv": (2, cv2.COLOR_YUV2BGR_YUY2),
 }
-MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}  # coefficients of each
+_POLYNOMIAL = (4, 5, 8, 12, 14)  # coefficients of OpenCV's model; drivers name it by either of two names
+MODELS = {"plumb_bob": _POLYNOMIAL, "rational_polynomial": _POLYNOMIAL, "equidistant": (4,)}
 
 
 class Lens(NamedTuple):
@@ -73,6 +74,19 @@ def pixels(image: Any) -> NDArray[np.uint8]:
         return out if conversion is None else cv2.cvtColor(out, conversion)  # type: ignore[return-value]
     except cv2.error:  # too small for a Bayer mosaic or for pairs of pixels
         raise ValueError(f"{width_px}x{height_px} is not a valid image size in {image.encoding}") from None
+
+
+def demosaiced(stored_as: str, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The decoded image of a sensor_msgs/CompressedImage with this `format`; a Bayer mosaic becomes BGR.
+
+    The format begins with the encoding of the raw image, as in `bayer_rggb8; jpeg compressed bgr8`.
+    """
+    encoding = stored_as.partition(";")[0].strip()
+    if image.ndim != 2 or not encoding.startswith("bayer_"):
+        return image
+    if encoding not in ENCODINGS or min(image.shape) < 4:
+        raise ValueError(f"encoding {encoding!r} of {image.shape[1]}x{image.shape[0]} px is not supported")
+    return cv2.cvtColor(image, ENCODINGS[encoding][1])  # type: ignore[return-value, arg-type]
 
 
 def lens(info: Any, rectified: bool) -> Lens:

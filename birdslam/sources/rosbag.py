@@ -19,7 +19,18 @@ from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.ros.bag import Bag, BagError, BagMessage, BagTopics, stamp_ns
 from birdslam.ros.frames import StaticFrames
-from birdslam.ros.sensor import CAMERA_INFO, IMAGES, SPEEDS, Lens, is_rectified, lens, pixels, speed, yaw_rate
+from birdslam.ros.sensor import (
+    CAMERA_INFO,
+    IMAGES,
+    SPEEDS,
+    Lens,
+    demosaiced,
+    is_rectified,
+    lens,
+    pixels,
+    speed,
+    yaw_rate,
+)
 from birdslam.sources.kitti import decode_image
 from birdslam.sources.recording import DatasetError, OwnLens, RecordedFrame, Recording
 from birdslam.sources.rosbag_truth import truth_rows
@@ -264,4 +275,6 @@ def _first_image(bag: Bag, topic: str) -> NDArray[np.uint8]:
 
 def _pixels(message: BagMessage) -> NDArray[np.uint8]:
     content = message.content
-    return decode_image(bytes(content.data)) if hasattr(content, "format") else pixels(content)
+    if not hasattr(content, "format"):
+        return pixels(content)
+    return demosaiced(str(content.format), decode_image(bytes(content.data)))

@@ -36,7 +36,19 @@ from birdslam.ros.rmw_zenoh import (
     sequence_of,
     type_of_key,
 )
-from birdslam.ros.sensor import CAMERA_INFO, FIX, IMAGES, SPEEDS, Lens, fix_row, is_rectified, lens, pixels, speed
+from birdslam.ros.sensor import (
+    CAMERA_INFO,
+    FIX,
+    IMAGES,
+    SPEEDS,
+    Lens,
+    demosaiced,
+    fix_row,
+    is_rectified,
+    lens,
+    pixels,
+    speed,
+)
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.nodes.sources import SourceError
 from birdslam.runtime.ros.session import ROUTER_S, NoRouter, RosNode
@@ -294,7 +306,9 @@ class RosCamera:
         kind = (came.type_name or "").replace("/msg/", "/")
         if kind not in IMAGES:
             raise ValueError(f"{self._topic} is {kind}; expected {' or '.join(IMAGES)}")
-        return decode_image(bytes(message.data)) if hasattr(message, "format") else pixels(message)
+        if not hasattr(message, "format"):
+            return pixels(message)
+        return demosaiced(str(message.format), decode_image(bytes(message.data)))
 
     def frames(self) -> Generator[RecordedFrame]:
         """Yields images on arrival, and frames without an image while none arrives."""
