@@ -1,9 +1,10 @@
 """Mutated bytes at every target: `make fuzz`, or `python -m tests.fuzz --cases 1000000 --seed 6`.
 
 Targets are the messages of the bus, what a subscriber, a planner and the optimizer make of them, references to frames
-in shared memory, and the files that a user gives: configuration, camera, manifest, speed. Whatever comes in is either
-accepted, and then is a whole valid record that can be sent on, or refused with the one exception that the target is
-there to raise. Anything else ends the run with status 1 and the case that did it. The same seed gives the same cases.
+in shared memory, and the files that a user gives: configuration, camera, calibration of another project, boxes,
+manifest, speeds, fixes. Whatever comes in is either accepted, and then is a whole valid record that can be sent on, or
+refused with the one exception that the target is there to raise. Anything else ends the run with status 1 and the case
+that did it. The same seed gives the same cases.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ import msgspec
 import numpy as np
 import zenoh
 
+from birdslam.calibration.camera_files import read_intrinsics
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.pose_graph import PoseGraph
@@ -45,11 +47,13 @@ from birdslam.runtime.transport.ring import FrameError, FrameReader, FrameRing
 from birdslam.runtime.wire import MAX_TRACE_BYTES, Trace, WireError, decode, encode
 from birdslam.slam import SlamConfig
 from birdslam.sources.camera_file import load_camera
+from birdslam.sources.detection_file import read_detection_file
 from birdslam.sources.kitti import read_image, read_projection, read_times
 from birdslam.sources.recording import DatasetError
 from birdslam.sources.speed_file import read_speeds
 from birdslam.types import INVALIDATING, Attitude, FrameRef, LineColour, LineKind, Measurements
 from tests.mutations import Chance, mutated, mutated_text, with_other_fields
+from tests.test_camera_files import FILES as OTHER_CAMERAS
 from tests.test_wire import BY_NAME, EXAMPLES
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -58,6 +62,16 @@ FIXES = [
     "time_s,latitude_deg,longitude_deg,speed_mps\n0.5,51.0,-114.1,12.5\n1.5,51.1,-114.2,\n",
     "$GPRMC,123519,A,4807.038,N,01131.000,E,022.4,084.4,230394,003.1,W*6A\n",
     '<gpx><trk><trkseg><trkpt lat="48.1" lon="11.5"><time>2020-01-01T00:00:00Z</time></trkpt></trkseg></trk></gpx>',
+    "$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\n",
+    "1\n00:00:01,000 --> 00:00:02,000\n[latitude: 48.1] [longitude: 11.5]\n\n2\n00:00:02,500 --> 0\nGPS(11.5,48.1,9)\n",
+    "lat,lon,unix_s,speed_kmh\n48.1,11.5,1600000000.5,12\n48.1,11.6,1600000001.5,\n",
+]
+BOXES = [
+    "1,7,10.5,20,30,40,0.9,1,0.8\n2,-1,10,20,30,40,-1,-1,-1,-1\n",
+    "0 3 Car 0 1 -1.5 10 20 30 40 1.5 1.6 3.9 1.0 1.6 20 -1.5 0.9\n",
+    '[{"image_id": 3, "category_id": 3, "bbox": [1, 2, 30, 4], "score": 0.5}]',
+    '{"annotations": [{"image_id": 1, "category_id": 1, "bbox": [1, 2, 30, 4], "score": 0.5}],'
+    ' "categories": [{"id": 1, "name": "car"}]}',
 ]
 Target = Callable[[Chance], bool]  # makes a case and tries it; whether it was let in
 
@@ -266,6 +280,18 @@ def _read_fixes(path: Path) -> None:
     assert all(abs(fix.latitude_deg) <= 90.0 and abs(fix.longitude_deg) <= 180.0 for fix in fixes)
 
 
+def _read_other_camera(path: Path) -> None:
+    lens = read_intrinsics(path)
+    assert np.isfinite([lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, *lens.distortion]).all()
+    assert min(lens.fx_px, lens.fy_px) > 0.0
+
+
+def _read_boxes(path: Path) -> None:
+    for detections in read_detection_file(path).values():
+        assert np.isfinite(detections.boxes_px).all()
+        assert ((detections.scores >= 0.0) & (detections.scores <= 1.0)).all()
+
+
 def _read_manifest(path: Path) -> None:
     assert isinstance(read_manifest(path), Manifest)
 
@@ -357,7 +383,7 @@ def _cameras() -> list[str]:
 
 def targets(folder: Path) -> Iterator[tuple[str, float, Callable[[], object]]]:
     """Name, share of all cases, and what makes the target."""
-    yield "bytes of messages", 0.555, bytes_of_messages
+    yield "bytes of messages", 0.525, bytes_of_messages
     yield "fields of messages", 0.17, fields_of_messages
     yield "optimizer", 0.02, optimizer
     yield "subscribers and planner", 0.13, subscribers
@@ -369,6 +395,14 @@ def targets(folder: Path) -> Iterator[tuple[str, float, Callable[[], object]]]:
     projections = "".join(f"P{i}: 700 0 300 {-i} 0 700 100 0 0 0 1 0\n" for i in range(2))
     for name, share, goods, read, refusal in (
         ("GNSS fixes", 0.01, FIXES, _read_fixes, GnssError),
+        (
+            "calibrations of others",
+            0.01,
+            [text for _, text in OTHER_CAMERAS.values()],
+            _read_other_camera,
+            DatasetError,
+        ),
+        ("boxes of others", 0.02, BOXES, _read_boxes, DatasetError),
         ("speed files", 0.01, [SPEEDS], _read_speeds, DatasetError),
         ("recordings' text files", 0.01, [times, projections], _read_recording, DatasetError),
         ("configuration files", 0.02, _configurations(), _read_configuration, ConfigurationError),
