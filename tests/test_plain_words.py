@@ -57,6 +57,15 @@ def test_truncated_film_is_reported_once() -> None:
     assert not any("cut off" in said for said in verdict(drive(100, 1, invalid_by={"frame_unreadable": 1})))
 
 
+def test_a_stationary_camera_is_named_instead_of_a_remedy_for_the_scale() -> None:
+    statuses = {"scale_invalid": 100, "standstill": 60}
+    said = "\n".join(verdict(drive(100, 100, invalid_by={"scale_invalid": 100}, statuses=statuses)))
+    assert "hardly moves" in said
+    assert "Remedy" not in said
+    said = "\n".join(verdict(drive(100, 99, invalid_by={"scale_invalid": 99}, statuses=statuses)))
+    assert "Remedy for scale_invalid" in said
+
+
 def test_reasons_are_listed_by_frequency() -> None:
     said = verdict(drive(100, 30, invalid_by={"camera_dark": 5, "scale_invalid": 30}, statuses={"scale_invalid": 30}))
     reasons = [line for line in said if line.startswith("Not valid")]
