@@ -17,7 +17,7 @@ CORES := $(or $(shell nproc 2>/dev/null),2)
 unexport PYTHONDONTWRITEBYTECODE
 ON_EACH_CHANGE := not slow and not faults and not onroad
 
-.PHONY: picture setup lock newest browser exiftool test test-cpus test-cpus-sample test-slow pythons wheel-test index-test fuzz faults onroad perf lint types train demo demo-kitti clean
+.PHONY: picture setup lock newest browser exiftool test test-cpus test-cpus-sample test-slow pythons wheel-test index-test fuzz faults onroad perf perf-check lint types train demo demo-kitti clean
 
 setup: $(VENV)/.ready
 
@@ -120,6 +120,10 @@ onroad: setup
 # Runs all benchmarks on this machine: out/perf/report.md
 perf: setup
 	$(BIN)/python -m perf all --output out/perf
+
+# Compares the times of this checkout with those of another commit, measured in turn; fails where it is 15 % slower
+perf-check: setup
+	$(BIN)/python -m perf check --base $(or $(BASE),HEAD^)
 
 # Trains the shipped networks from a seed on the built-in world (hours on four cores); continues an interrupted run
 train: $(TRAIN_VENV)/.ready

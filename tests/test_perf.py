@@ -16,13 +16,12 @@ from hypothesis import strategies as st
 
 from birdslam.geometry.se2 import SE2
 from birdslam.perf.__main__ import main
-from birdslam.perf.errors import PerfError
 from birdslam.perf.latency import convoy, optimizer, system, transport
 from birdslam.perf.latency.drive import DriveConfig
 from birdslam.perf.latency.live import Run, Sample
 from birdslam.perf.reporting import all as everything
-from birdslam.perf.reporting import compare, ratios, report
-from birdslam.perf.reporting.figures import BLOCKS, Ledger, curve, noise, spread
+from birdslam.perf.reporting import check, ratios, report
+from birdslam.perf.reporting.figures import Ledger, curve, spread
 from birdslam.runtime.cli import main as birdslam
 from birdslam.runtime.transport.bus import Message
 from birdslam.runtime.wire import Stage, Trace
@@ -44,60 +43,27 @@ def test_a_spread_is_ordered_and_within_its_series(values: list[float]) -> None:
 def test_empty_series_has_no_result() -> None:
     assert spread([]) == {"n": 0}
     assert curve([]) == []
-    assert noise("age_ms", [1.0] * (2 * BLOCKS - 1)) == {}
 
 
-def test_noise_is_the_blocks_of_a_series() -> None:
-    found = noise("age_ms", np.repeat(np.arange(BLOCKS, dtype=float), 7))
-    assert found == {"age_ms.p50": list(range(BLOCKS)), "age_ms.p99": list(range(BLOCKS))}
+def test_ratio_of_two_versions_is_the_median_over_the_rounds() -> None:
+    """One disturbed round of five changes nothing."""
+    times = [(np.full(50, 2.0), np.full(50, 3.0))] * 4 + [(np.full(50, 2.0), np.full(50, 90.0))]
+    assert check.ratio(times, 50) == {"base_ms": 2.0, "ms": 3.0, "ratio": 1.5}
 
 
-def _report(shift: float, seed: int, dropped: int = 0, exact: float = 0.5) -> dict[str, Any]:
-    values = np.random.default_rng(seed).gamma(9.0, 1.0, 600) * shift
-    row = {"name": "ring", "noise": noise("latency_ms", values), "dropped": dropped, "sent": 600}
-    return {"benchmarks": {"transport": {"rows": [row, {"name": "offline", "exact": {"ate_m": exact}}]}}}
+def test_check_of_an_unknown_commit_is_a_one_line_error(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", "--base", "no-such-commit"]) == 2
+    assert "no-such-commit" in capsys.readouterr().err
 
 
-def _verdicts(old: list[Any], new: list[Any]) -> dict[str, str]:
-    return {line.name: line.verdict for line in compare.compare(old, new)}
-
-
-def test_compare_calls_noise_not_distinguishable() -> None:
-    for seed in range(20):
-        verdicts = _verdicts([_report(1.0, seed)], [_report(1.0, 100 + seed)])
-        assert set(verdicts.values()) == {"not distinguishable"}
-
-
-def test_compare_finds_changes_and_their_direction() -> None:
-    worse = _verdicts([_report(1.0, 1)], [_report(1.5, 2, dropped=200, exact=0.6)])
-    better = _verdicts([_report(1.5, 2, dropped=200, exact=0.6)], [_report(1.0, 1)])
-    assert set(worse) == {
-        "transport / ring / latency_ms.p50",
-        "transport / ring / latency_ms.p99",
-        "transport / ring / dropped",
-        "transport / offline / ate_m (exact)",
-    }
-    assert set(worse.values()) == {"worse"}
-    assert set(better.values()) == {"better"}
-
-
-def test_compare_ignores_small_shifts() -> None:
-    assert set(_verdicts([_report(1.0, 1)] * 9, [_report(1.02, 1)] * 9).values()) == {"not distinguishable"}
-
-
-def test_compare_exits_by_its_verdict(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    paths = []
-    for name, content in (("old", _report(1.0, 1)), ("new", _report(2.0, 2))):
-        paths.append(tmp_path / f"{name}.json")
-        paths[-1].write_text(json.dumps(content))
-    old, new = map(str, paths)
-    assert main(["compare", old, old]) == 0
-    assert main(["compare", old, new]) == 1
-    assert main(["compare", new, old]) == 0
-    assert main(["compare", old, str(tmp_path / "absent.json")]) == 2
-    assert "absent.json: No such file" in capsys.readouterr().err
-    with pytest.raises(PerfError, match="no result in common"):
-        compare.compare([_report(1.0, 1)], [{}])
+@pytest.mark.slow
+@pytest.mark.processes
+def test_check_fails_for_a_slower_version(monkeypatch: pytest.MonkeyPatch) -> None:
+    arguments = ["check", "--base", "HEAD", "--rounds", "3", "--frames", "30"]
+    monkeypatch.setattr(check, "LIMIT", 5.0)
+    assert main(arguments) == 0
+    monkeypatch.setattr(check, "LIMIT", 0.2)
+    assert main(arguments) == 1
 
 
 def _cut_short(path: Path) -> None:
@@ -257,7 +223,7 @@ def test_the_optimize_process_is_driven_with_vehicles_at_the_rate() -> None:
 def test_every_benchmark_has_a_label(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([]) == 0
     listed = {line.split()[0] for line in capsys.readouterr().out.splitlines()}
-    assert {step.benchmark for step in everything.STEPS} | {"all", "compare"} <= listed
+    assert {step.benchmark for step in everything.STEPS} | {"all", "check"} <= listed
     assert main(["nothing"]) == 2
 
 
@@ -301,12 +267,11 @@ def test_carriers_deliver_every_message_of_a_slow_stream() -> None:
 
 
 @pytest.mark.processes
-def test_the_optimizer_is_measured_with_its_noise(tmp_path: Path) -> None:
+def test_the_optimizer_is_measured(tmp_path: Path) -> None:
     log = tmp_path / "log"
     optimizer.write_log(log, DriveConfig(frames=60, vehicles=1), seed=1)
     row = optimizer.measure("ours", 1, log, 10.0)
     assert row["frames"] == 60
-    assert len(row["noise"]["time_us.p50"]) == BLOCKS
     assert len(row["over_frames_us"]) == 50
 
 

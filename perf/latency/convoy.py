@@ -21,7 +21,7 @@ import psutil
 
 from birdslam.perf.errors import PerfError
 from birdslam.perf.latency.drive import DriveConfig, drive
-from birdslam.perf.reporting.figures import curve, noise, spread
+from birdslam.perf.reporting.figures import curve, spread
 from birdslam.perf.reporting.machine import Steal
 from birdslam.runtime.configuration import Configuration, complete, load, parse_setting
 from birdslam.runtime.fields import parted
@@ -101,7 +101,6 @@ def _row(
         "step_ms": spread(step_ms),
         "curve_ms": curve(step_ms),
         "steal_percent": steal.percent(),
-        "noise": noise("step_ms", step_ms),
     }
 
 

@@ -30,7 +30,7 @@ from birdslam.graph.weights import WeightsConfig
 from birdslam.perf.latency.drive import DriveConfig, drive
 from birdslam.perf.latency.smoothers import Smoother
 from birdslam.perf.reporting.arguments import benchmark_parser
-from birdslam.perf.reporting.figures import Ledger, curve, noise, spread
+from birdslam.perf.reporting.figures import Ledger, curve, spread
 from birdslam.perf.reporting.machine import Steal
 from birdslam.types import FIRST_PERSON, FollowedPerson, Measurements
 
@@ -168,7 +168,6 @@ def _drive_through(contender: str, vehicles: int, log: Path, limit_s: float) -> 
         "kinds_us": {kind: spread(times_us[kinds[:frames] == kind]) for kind in ("cp", "traffic", "other")},
         "curve_us": curve(times_us),
         "over_frames_us": [round(float(np.median(part)), 1) for part in np.array_split(times_us, _PARTS) if part.size],
-        "noise": noise("time_us", times_us),
     }
 
 

@@ -21,12 +21,11 @@ from birdslam.geometry.arrays import Floats
 from birdslam.perf.latency import convoy
 from birdslam.perf.latency.live import Ask, Run, add_run_options, drive
 from birdslam.perf.reporting.arguments import benchmark_parser, numbers
-from birdslam.perf.reporting.figures import BLOCKS, Ledger, curve, noise, spread, spread_text
+from birdslam.perf.reporting.figures import Ledger, curve, spread, spread_text
 from birdslam.perf.reporting.machine import Steal
 from birdslam.runtime.configuration import BudgetsConfig
 from birdslam.runtime.doctor.costs import busy_cores
 from birdslam.runtime.latency import key_of, queue_of, stages
-from birdslam.runtime.topology import NODES
 from birdslam.runtime.transport.bus import Message
 from birdslam.types import Status
 
@@ -116,7 +115,6 @@ def figures(result: Run, warm_up_s: float = 0.0) -> dict[str, Any]:
         "budgets": list(budgets(summary["configuration"]["budgets"], age_ms, parts_ms)),
         "configuration": summary["configuration"],
         "networks": summary["models"],
-        "noise": noise("age_ms", age_ms) | noise("period_ms", periods_ms) | _noise_of_cpu(cpu),
     }
 
 
@@ -184,14 +182,6 @@ def usage(result: Run) -> tuple[dict[str, list[float]], dict[str, float]]:
         for name, mb in sample.rss_mb.items():
             most_mb[name] = max(most_mb.get(name, 0.0), mb)
     return dict(sorted(cores.items())), dict(sorted(most_mb.items()))
-
-
-def _noise_of_cpu(cpu: dict[str, list[float]]) -> dict[str, list[float]]:
-    seconds = min((len(values) for name, values in cpu.items() if name in NODES), default=0)
-    if seconds < BLOCKS:
-        return {}
-    total = np.sum([values[:seconds] for name, values in cpu.items() if name in NODES], axis=0)
-    return {"cpu_cores": [round(float(block.mean()), 4) for block in np.array_split(total, BLOCKS)]}
 
 
 def budgets(configured: dict[str, float], age_ms: Floats, parts_ms: dict[str, Floats]) -> Iterator[dict[str, Any]]:

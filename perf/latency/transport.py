@@ -18,7 +18,7 @@ from typing import Any
 
 from birdslam.perf.latency.carriers import CARRIERS
 from birdslam.perf.reporting.arguments import benchmark_parser, numbers
-from birdslam.perf.reporting.figures import Ledger, curve, noise, spread, spread_text
+from birdslam.perf.reporting.figures import Ledger, curve, spread, spread_text
 from birdslam.perf.reporting.machine import Steal
 from birdslam.runtime.doctor.costs import busy_cores
 
@@ -113,7 +113,6 @@ def measure(case: Case, seconds: float) -> dict[str, Any]:
         "sent": messages,
         "dropped": messages - len(latency_ms),
         "steal_percent": steal.percent(),
-        "noise": noise("latency_ms", latency_ms),
     }
 
 

@@ -1,4 +1,4 @@
-"""Storage of results: distributions with their noise, in a file that is complete after every row."""
+"""Storage of results: distributions, in a file that is complete after every row."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike
 from birdslam.geometry.arrays import Floats
 from birdslam.perf.reporting.machine import Steal, describe, describe_text
 
-BLOCKS = 10  # consecutive parts of a series; their spread is its noise
 _LEVELS = (0.0, 1.0, 5.0, *range(10, 91, 10), 95.0, 98.0, 99.0, 99.5, 99.9, 99.99)  # percent, for the plots
 
 
@@ -26,15 +25,6 @@ def spread(values: ArrayLike) -> dict[str, float]:
     p50, p99, p999 = np.percentile(series, [50.0, 99.0, 99.9])
     found = {"p50": p50, "p99": p99, "p999": p999, "max": series.max()}
     return {name: round(float(value), 4) for name, value in found.items()} | {"n": int(series.size)}
-
-
-def noise(name: str, values: ArrayLike) -> dict[str, list[float]]:
-    """p50 and p99 of the blocks of a series, for `compare`: "NAME.p50" and "NAME.p99"."""
-    series = np.asarray(values, dtype=np.float64)
-    if series.size < 2 * BLOCKS:
-        return {}
-    blocks = np.array_split(series, BLOCKS)
-    return {f"{name}.p{q}": [round(float(np.percentile(block, q)), 4) for block in blocks] for q in (50, 99)}
 
 
 def curve(values: ArrayLike) -> list[list[float]]:

@@ -56,7 +56,6 @@ def run(arguments: list[str]) -> int:
                 line,
                 rounds=values,
                 median=float(np.median(values)),
-                noise={"ratio": values},
                 **msgspec.structs.asdict(bound),
             )
     return 1 if worse(found, bounds) else 0

@@ -30,7 +30,6 @@ from numpy.typing import ArrayLike
 from birdslam.geometry.arrays import Floats
 from birdslam.loops.map_file import MapError
 from birdslam.perf.reporting.arguments import benchmark_parser
-from birdslam.perf.reporting.figures import BLOCKS
 from birdslam.perf.robustness.faulty_vehicle import Vehicle, exit_on_sigterm, model_options, record_options
 from birdslam.runtime.maps.map_store import read_map
 from birdslam.runtime.transport.closing import Closing
@@ -39,6 +38,7 @@ label = "memory, descriptors, watchdogs and drops of every process over a long d
 
 MAP_FILE = "soak.map"
 WARM_S, SAMPLE_S, PRINT_S = 60.0, 5.0, 30.0
+BLOCKS = 10  # consecutive parts of a series, for slopes
 SPAN = 6  # samples at either end whose medians are compared, to average garbage collection
 GROWTH = 0.01
 SHIFT_H = 8.0  # duration for the extrapolation of the second half
