@@ -69,7 +69,7 @@ class Bus(Closing):
         listen = [hub_socket] if hub else [own_socket] if node in PROCESSES else []
         before = own_threads()
         try:
-            self._session = open_session(session_config(listen, [] if hub else [hub_socket], lossless))
+            self._session = open_session(session_config(listen, [] if hub else [hub_socket], lossless or bool(listen)))
         except zenoh.ZError as error:
             where = ", ".join(map(str, listen)) or hub_socket
             raise BusError(f"{node} can't join the bus of vehicle {vehicle!r} ({where}): {error}") from error

@@ -10,15 +10,19 @@ from typing import Any
 import zenoh
 
 _URGENT_BATCHES = 16  # zenoh's largest
-_LEASE_MS = 1_000  # a stopped or unreachable peer is disconnected after this time
+_LEASE_MS = 1_000  # a planner that is stopped for this time is disconnected, so that it delays no publisher
 _RETRY = {"period_init_ms": 50, "period_max_ms": 200, "period_increase_factor": 2}
 _MAX_ZENOH_BYTES = 1 << 17  # two of the largest messages; zenoh's default is 1 GiB
 _MAX_FILTER_BYTES = 65_000  # payload and attachment; zenoh silently drops larger messages, so wire.py rejects them
-_LOSSLESS_TIMEOUT_US = 60_000_000  # a blocked put waits so long before zenoh closes the link
+_PATIENCE_US = 60_000_000  # between the processes of a run, before zenoh closes a silent or full link
 
 
-def session_config(listen: list[Path], connect: list[Path], lossless: bool) -> zenoh.Config:
-    """Returns zenoh's configuration with the unix sockets to listen on and to connect to."""
+def session_config(listen: list[Path], connect: list[Path], patient: bool) -> zenoh.Config:
+    """Returns zenoh's configuration with the unix sockets to listen on and to connect to.
+
+    `patient`: for the processes of a run, which the supervisor watches. On a busy computer one of them may get no core
+    for seconds, and a closed link would lose the record that ends the run. The death of a process closes its links.
+    """
     settings: dict[str, Any] = {
         "mode": "peer",
         "listen/endpoints": [f"unixsock-stream/{path}" for path in listen],
@@ -45,9 +49,9 @@ def session_config(listen: list[Path], connect: list[Path], lossless: bool) -> z
             }
         ],
     }
-    if lossless:  # a process without a core for seconds loses no message; the death of a process still closes the link
-        settings["transport/link/tx/queue/congestion_control/block/wait_before_close"] = _LOSSLESS_TIMEOUT_US
-        settings["transport/link/tx/lease"] = _LOSSLESS_TIMEOUT_US // 1_000
+    if patient:
+        settings["transport/link/tx/queue/congestion_control/block/wait_before_close"] = _PATIENCE_US
+        settings["transport/link/tx/lease"] = _PATIENCE_US // 1_000
     config = zenoh.Config()
     for name, value in settings.items():
         config.insert_json5(name, json.dumps(value))
