@@ -16,30 +16,35 @@ from birdslam.bench.tracking.localisation import (
     measure,
     summarise_ranges,
 )
+from birdslam.bench.tracking.stationary import StationaryRow, stationary_tracks, summarise_stationary
 from birdslam.frontend import FrontEndConfig
 from birdslam.runtime.configuration import ConfigurationError
 from birdslam.runtime.progress import Progress
+from birdslam.slam import SlamConfig
 from birdslam.sources.kitti_tracking import open_tracking, read_detections
 from birdslam.sources.recording import DatasetError
 
 
 def evaluate_localisation(
-    root: Path, names: Sequence[str], config: FrontEndConfig, draws: int = 1
-) -> list[LocalisationRow]:
-    """Returns position errors of cars by range; the tilt error is drawn `draws` times, evaluated together.
+    root: Path, names: Sequence[str], config: SlamConfig, draws: int = 1
+) -> tuple[list[LocalisationRow], StationaryRow | None]:
+    """Returns position errors of cars by range, and the drift of stationary vehicles in the pose graph.
 
-    Raises DatasetError.
+    The tilt error is drawn `draws` times, evaluated together. Raises DatasetError.
     """
     sequences = [open_tracking(root, name, CAMERA_OF_BOXES) for name in names]
     errors: list[CarError] = []
+    stationary = []
     with Progress("localisation", draws * sum(map(len, sequences))) as progress:
         progress.reach(0)
         for sequence in sequences:
             found = read_detections(root / BOXES, sequence.name, len(sequence))
             for draw in range(draws):
-                errors += match_cars(sequence, measure(sequence, found, config, draw))
+                measurements = measure(sequence, found, config.frontend, draw)
+                errors += match_cars(sequence, measurements)
+                stationary += stationary_tracks(sequence, measurements, config)
                 progress.advance(len(sequence))
-    return summarise_ranges(errors)
+    return summarise_ranges(errors), summarise_stationary(stationary)
 
 
 def evaluate_people(

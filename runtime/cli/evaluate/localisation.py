@@ -9,6 +9,7 @@ from pathlib import Path
 from birdslam.bench.tracking.by_class.class_tracks import TracksRow
 from birdslam.bench.tracking.by_class.people import PEOPLE, PeopleRow
 from birdslam.bench.tracking.localisation import LocalisationRow
+from birdslam.bench.tracking.stationary import StationaryRow
 from birdslam.outputs.drive_files import claim_directory, write_json
 from birdslam.runtime.cli.arguments import add_config, add_settings, add_tracking_root
 from birdslam.runtime.configuration import ConfigurationError
@@ -31,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Writes report.json, and prints it as a table."""
-    config = configuration_of(options).slam.frontend
+    config = configuration_of(options).slam
     output = Path(options.output)
     if options.draws < 1:
         raise ConfigurationError(f"--draws {options.draws}: expected 1 or more")
@@ -40,11 +41,13 @@ def run(options: argparse.Namespace) -> int:
     claim_directory(output)
     names = sequences_of(options.root, options.sequences)
     if options.kind == "car":
-        rows = evaluate_localisation(options.root, names, config, options.draws)
+        rows, stationary = evaluate_localisation(options.root, names, config, options.draws)
         write_json(output / "report.json", rows)
+        write_json(output / "stationary.json", stationary)
         print(_table(rows))
+        print(_line_of_stationary(stationary))
     else:
-        people, tracks = evaluate_people(options.root, names, config, options.kind)
+        people, tracks = evaluate_people(options.root, names, config.frontend, options.kind)
         write_json(output / "report.json", {"places": people, "tracks": tracks})
         print(_table_of_people(people))
         print(_table_of_tracks(tracks))
@@ -73,6 +76,16 @@ def _table(rows: Sequence[LocalisationRow]) -> str:
         places = f"{_places(row)}{_in_columns([(row.nees, '7.2f')])}"
         lines.append(f"{row.sequence:12}{row.range:>9}{row.cars:>6}{row.n:>7}{places}")
     return "\n".join(lines)
+
+
+def _line_of_stationary(row: StationaryRow | None) -> str:
+    if row is None:
+        return "stationary vehicles: none"
+    return (
+        f"stationary vehicles, {row.tracks} tracks: drift in world {row.drift_median_m:.2f} m from first to last sight "
+        f"(median), {row.inside_2_sigma:.0%} inside 2 sigma, path {row.path_median_m:.2f} m (median), "
+        f"{row.false_movers} reported as moving"
+    )
 
 
 def _table_of_people(rows: Sequence[PeopleRow]) -> str:
