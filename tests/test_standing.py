@@ -158,6 +158,35 @@ def test_planners_see_the_status() -> None:
     assert {v.moves for v in as_published} == {Moves.UNDECIDED}
 
 
+def test_stationary_vehicle_has_one_position_and_follows_when_it_starts() -> None:
+    """Its edges err by up to 1.5 m; the position in world stays, its covariance shrinks, and a start is followed."""
+    rng, graph, told = np.random.default_rng(1), PoseGraph(GraphConfig(), WeightsConfig()), []
+    for k in range(70):
+        started_s = max(0.0, (k - 45) / 10.0)
+        cov = np.diag([0.5, 0.1, 0.01])
+        off = rng.multivariate_normal(np.zeros(2), cov[:2, :2])
+        seen = VehicleEdge(
+            vehicle=1,
+            frame=k,
+            T_ego_vehicle=SE2(60.0 - 0.5 * k + 4.0 * started_s + off[0], 4.0 + off[1]),
+            cov=tuple(cov.ravel()),
+            standing=0.02 if started_s > 0.5 else 0.98,
+        )
+        step = EgoEdge(from_frame=k - 1, to_frame=k, T_from_to=SE2(0.5), cov=tuple((1e-8 * np.eye(3)).ravel()))
+        times = dict.fromkeys(("t_source_ns", "t_capture_ns", "t_utc_ns"), k * 100_000_000)
+        told += graph.optimise(Measurements(frame_id=k, **times, cc=step if k else None, cv=(seen,))).vehicles
+    still = [v for v in told[:45] if v.moves is Moves.STANDING]
+    assert len(still) > 30
+    at = np.array([(v.T_world_vehicle.x_m, v.T_world_vehicle.y_m) for v in still])
+    assert np.linalg.norm(np.diff(at[15:], axis=0), axis=1).max() < 0.2
+    assert np.linalg.norm(at[20:] - [60.0, 4.0], axis=1).max() < 0.4
+    variances = np.array([v.cov[0] for v in still])
+    assert (np.diff(variances) < 1e-6).all()
+    assert told[-1].moves is not Moves.STANDING
+    assert told[-1].T_world_vehicle.x_m == pytest.approx(60.0 + 4.0 * 2.4, abs=1.5)
+    assert told[-1].velocity_mps[0] == pytest.approx(4.0, abs=1.5)
+
+
 def test_size_error_does_not_average_out() -> None:
     """Vehicles that are all off by their sizes' errors, in each frame alike, and the velocities that come of it."""
     rng, sigma, frames = np.random.default_rng(3), 0.06, 25

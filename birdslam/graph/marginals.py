@@ -52,7 +52,7 @@ def vehicle_estimates(
     """
     if not vehicles:
         return ()
-    ahead_s = np.array([max((t_ns - v.node_ns) * 1e-9, 0.0) for v in vehicles])
+    ahead_s = np.array([0.0 if v.is_fixed else max((t_ns - v.node_ns) * 1e-9, 0.0) for v in vehicles])
     sizes = np.array([v.size_bias_rel for v in vehicles])  # relative 1-sigma of each distance due to the size
     at, heading, velocities, covs = marginals_in_world(window, ahead_s, changes)
     covs += _of_sizes(window.world, ego_mps, sizes, at, heading, velocities)

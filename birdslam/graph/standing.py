@@ -42,7 +42,10 @@ def judge(vehicles: Sequence[VehicleNode], velocities: Floats, covs: Floats, bir
     seen = np.array([vehicles[row].standing_seen for row in rows], np.float64)
     # Both probabilities assume PRIOR
     beside = np.array([vehicles[row].beside for row in rows]) * (_logit(PRIOR_BESIDE) - _logit(PRIOR))
-    pooled = _probability((by_velocity + _clipped(_logit(seen))) / 2.0 + beside)
+    by_growth = _clipped(_logit(seen))
+    # The graph does not estimate the velocity of a fixed vehicle
+    by_velocity = np.where([vehicles[row].is_fixed for row in rows], by_growth, by_velocity)
+    pooled = _probability((by_velocity + by_growth) / 2.0 + beside)
     alone = _probability(by_velocity)
     for row, standing, by_velocity_alone in zip(rows, pooled.tolist(), alone.tolist(), strict=True):
         v = vehicles[row]

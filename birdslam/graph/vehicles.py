@@ -41,6 +41,7 @@ class VehicleNode:
     size_bias_rel: float = 0.0  # relative 1-sigma of its distance due to its size, common to all frames
     standing: float | None = None  # probability of being stationary, from all evidence; None: no evidence
     moves: Moves = Moves.UNDECIDED
+    is_fixed: bool = False  # by the stationary model: its position in world has no process noise
     height_m: float = 0.0  # 0: unknown
     sigma_height_m: float = 0.0
 

@@ -5,10 +5,13 @@ The twist (velocity in the vehicle's frame) follows a random walk. `Window.propa
 
 from __future__ import annotations
 
+import numpy as np
+
 from birdslam.graph.costs import Triple
 from birdslam.graph.factors.factor import Factor, GraphFrame
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.window import Window
+from birdslam.types import Moves
 
 
 def twist_growth(config: GraphConfig) -> Triple:
@@ -17,7 +20,11 @@ def twist_growth(config: GraphConfig) -> Triple:
 
 
 class ConstantVelocity(Factor):
-    """Sets the process noise of the twists; precedes the odometry, which propagates the vehicles."""
+    """Sets the process noise of the twists, none for stationary vehicles; precedes the odometry, which propagates them.
+
+    A vehicle that was decided to be stationary has a fixed position in world, so its covariance only shrinks. Its twist
+    is that of a vehicle that may start, and moves it again after the decision is revoked.
+    """
 
     name = "constant velocity"
     equation = "in place of Eq. 6's VV edges"
@@ -26,5 +33,12 @@ class ConstantVelocity(Factor):
         self._growth = twist_growth(config)
 
     def predict(self, frame: GraphFrame, window: Window) -> None:
-        """Sets the growth of the twists' variances for this frame."""
-        frame.twist_growth = self._growth
+        """Sets the growth of the twists' variances for this frame, and the rows of stationary vehicles."""
+        frame.twist_growth, nodes = self._growth, frame.vehicles.nodes
+        fixed = [row for row, v in enumerate(nodes) if v.moves is Moves.STANDING and not v.in_path]
+        if begun := [row for row in fixed if not nodes[row].is_fixed]:
+            still = np.zeros(len(begun))
+            window.set_twists(begun, still, still, np.tile(np.diag(self._growth), (len(begun), 1, 1)))
+        for row, v in enumerate(nodes):
+            v.is_fixed = row in fixed
+        frame.fixed = fixed
