@@ -321,6 +321,20 @@ def test_hidden_person_does_not_take_a_neighbours_box(label: str, widths_m: tupl
     assert [person.person for person in told if person.age_ns == 0] == [neighbour.person]
 
 
+@pytest.mark.parametrize("far_m", [24.0, 28.0])
+def test_far_person_is_not_a_near_one_with_hidden_feet(far_m: float) -> None:
+    """The heads of both are at the horizon; hidden feet shorten a box, but do not make it narrower."""
+    scene = Scene()
+    for _ in range(10):
+        (near,) = scene.see(found([box_of(9.0, 0.0)])) or (None,)
+    for _ in range(5):
+        people = scene.see(found([box_of(far_m, 0.0)]))
+    assert near is not None
+    (far,) = [person for person in people if person.age_ns == 0]
+    assert far.person != near.person
+    assert far.x_m == pytest.approx(far_m, rel=0.15)
+
+
 def test_skipped_frames_only_grow_the_covariance() -> None:
     scene = Scene()
     for _ in range(5):

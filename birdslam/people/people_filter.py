@@ -271,11 +271,10 @@ class PeopleFilter:
         self._shared = shared
 
     def distances(self, boxes: Sequence[PersonBox], T_world_ego: SE2, road: RoadProfile) -> tuple[Floats, Floats]:
-        """(N, M) squared Mahalanobis distances of boxes from people, and -2 log likelihoods.
+        """(2, N, M) squared Mahalanobis distances of boxes from people, and -2 log likelihoods.
 
-        Each is for the better hypothesis, visible or hidden feet.
+        The first are with visible feet, the second with hidden feet.
         """
-        n = len(self._x)
         x = np.repeat(self._x[:, :, None], 2, axis=2)
         expected, J = expected_boxes(x, T_world_ego, road, self._sizes[:, 0], self._sizes[:, 2], self.config)
         expected, J = expected[..., :WIDTH], J[..., :WIDTH, :]
@@ -287,11 +286,10 @@ class PeopleFilter:
         noise = np.stack([R, R])
         hide_feet(noise[1], np.exp(z[:, TALL]) / (1.0 - self.config.hidden_share), self.config)
         hidden = np.array([b.hidden for b in boxes])
-        squared, costs = np.full((n, len(boxes)), np.inf), np.full((n, len(boxes)), np.inf)
+        squared, costs = np.empty((2, 2, len(self._x), len(boxes)))
         for k, prior in enumerate((1.0 - hidden, hidden)):
             gap = z[None, :, :WIDTH] - mean[:, None, k]
             whole = S[:, None, k] + noise[k][None, :, :WIDTH, :WIDTH]
-            d2 = (gap[..., None, :] @ np.linalg.inv(whole) @ gap[..., None])[..., 0, 0]
-            cost = d2 + np.linalg.slogdet(whole)[1] - 2.0 * np.log(prior)[None]
-            squared, costs = np.where(cost < costs, d2, squared), np.minimum(costs, cost)
+            squared[k] = (gap[..., None, :] @ np.linalg.inv(whole) @ gap[..., None])[..., 0, 0]
+            costs[k] = squared[k] + np.linalg.slogdet(whole)[1] - 2.0 * np.log(prior)
         return squared, costs

@@ -130,9 +130,11 @@ class PeopleTracker:
         if not boxes or not self.tracks:
             return []
         squared, costs = self.filter.distances(boxes, frame.ego.T_world_ego, road)
+        costs += self._shape_costs(boxes, frame.ego.t_source_ns)
+        squared, costs = np.where(costs[0] <= costs[1], squared[0], squared[1]), costs.min(axis=0)
         t_ns = frame.ego.t_source_ns
         since_s = max((t_ns - max(track.seen_ns for track in self.tracks)) * 1e-9, MIN_DT_S)  # anybody had a box
-        costs += self._detection_costs(since_s) + self._class_costs(boxes) + self._shape_costs(boxes, t_ns)
+        costs += self._detection_costs(since_s) + self._class_costs(boxes)
         cost = np.where(squared <= self.config.gate, costs, IMPOSSIBLE_COST)
         new = -2.0 * math.log(NEW_PER_S * since_s)
         births = np.where(np.eye(len(boxes)), new, IMPOSSIBLE_COST)  # one row per box, for a new person
@@ -161,15 +163,23 @@ class PeopleTracker:
         return np.asarray(-2.0 * np.log((np.where(rides, all_votes - walked, walked) + 1.0) / (all_votes + 2.0)))
 
     def _shape_costs(self, boxes: Sequence[PersonBox], t_ns: int) -> Floats:
-        """(N, M) -2 log likelihood ratio of the aspect of each box, given the last box of each track.
+        """(2, N, M) -2 log likelihood ratio of the shape of each box, given the last box of each track.
 
+        With visible feet (first) the aspect stays, with hidden feet (second) the width, while the height shrinks.
         Student's t, since limbs swing and are occluded.
         """
         config, before = self.config, [track.box for track in self.tracks]
-        last, now = ([box.log_width - math.log(max(box.tan_height, MIN_SLOPE)) for box in of] for of in (before, boxes))
+        (last_width, last), (now_width, now) = (
+            (
+                np.array([box.log_width for box in of]),
+                np.array([box.log_width - math.log(max(box.tan_height, MIN_SLOPE)) for box in of]),
+            )
+            for of in (before, boxes)
+        )
         unseen_s = np.array([(t_ns - track.seen_ns) * 1e-9 for track in self.tracks])[:, None]
         variance = config.sigma_shape**2 - config.sigma_stride**2 * np.expm1(-unseen_s / config.stride_s)
-        squared = np.square(np.subtract.outer(last, now)) / variance
+        off = np.stack([np.subtract.outer(last, now), np.subtract.outer(last_width, now_width)])
+        squared = np.square(off) / variance
         cost = (SHAPE_DOF + 1.0) * np.log1p(squared / SHAPE_DOF) + np.log(variance / config.sigma_shapes**2)
         same = np.equal.outer([box.label for box in before], [box.label for box in boxes])
         return np.where(same, cost, 0.0)
