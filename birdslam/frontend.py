@@ -126,7 +126,7 @@ class FrontEnd:
         camera, config = self.camera, self.config
         self._dead_reckoning = DeadReckoning(camera, config.static_map.attitude_memory_m)
         self._plausibility = PlausibilityGate(config.plausibility)
-        self.people = PeopleTracker(camera, config.people, first_person)
+        self.people = PeopleTracker(camera, config.people, config.tracking, config.localisation, first_person)
         self.vehicles = OutOfSequenceTracker(
             Tracker(
                 camera,

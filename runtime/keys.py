@@ -156,8 +156,8 @@ GROUPS = (
         "",
         {
             "vehicle": "Name of the vehicle on the bus",
-            "slam.frontend.tracking.birth_score": "Lowest detector score of a new vehicle",
-            "slam.frontend.tracking.confirm_hits": "Number of detections before a vehicle is reported",
+            "slam.frontend.tracking.birth_score": "Lowest detector score of a new road user",
+            "slam.frontend.tracking.confirm_hits": "Number of detections before a road user is reported",
             "slam.graph.forget_s": "Time for which a vehicle out of sight is reported",
             "slam.graph.max_vehicles": "Highest number of vehicles",
             "slam.frontend.localisation.max_range_m": "Highest distance of vehicles",

@@ -41,11 +41,13 @@ from birdslam.types import (
 )
 from birdslam.vehicles.out_of_sequence import OpenFrame
 from birdslam.vehicles.placed_boxes import place_boxes
+from birdslam.vehicles.placement.localisation import LocalisationConfig
 from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
 from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
-from birdslam.vehicles.track import EgoFrame
+from birdslam.vehicles.track import EgoFrame, TrackingConfig
 from tests.recordings import KITTI as CAMERA
 
+BOXES = PeopleBoxesConfig(), LocalisationConfig()
 ROAD = GroundSizeFilter(CAMERA, GroundSizeConfig())
 Box = tuple[float, float, float, float]
 HZ = 10.0
@@ -72,7 +74,7 @@ class Scene:
     """A tracker, and the ego that drives along x."""
 
     def __init__(self, ego_mps: float = 0.0) -> None:
-        self.tracker = PeopleTracker(CAMERA, PeopleTrackingConfig())
+        self.tracker = PeopleTracker(CAMERA, PeopleTrackingConfig(), TrackingConfig(), LocalisationConfig())
         self.ego_mps, self.k = ego_mps, 0
 
     @property
@@ -90,7 +92,7 @@ class Scene:
 
 
 def observed(boxes: list[Box], labels: list[str]) -> list[str]:
-    return [box.label for box in observe_people(found(boxes, labels), CAMERA, CAMERA.ground, PeopleBoxesConfig())]
+    return [box.label for box in observe_people(found(boxes, labels), CAMERA, CAMERA.ground, *BOXES)]
 
 
 # --- which boxes are whom ---
@@ -98,7 +100,7 @@ def observed(boxes: list[Box], labels: list[str]) -> list[str]:
 
 def test_rider_and_bicycle_are_one_and_motorcyclist_is_not_a_pedestrian() -> None:
     person, mount = (600.0, 150.0, 640.0, 250.0), (595.0, 200.0, 645.0, 265.0)
-    (whole,) = observe_people(found([person, mount], ["person", "bicycle"]), CAMERA, CAMERA.ground, PeopleBoxesConfig())
+    (whole,) = observe_people(found([person, mount], ["person", "bicycle"]), CAMERA, CAMERA.ground, *BOXES)
     assert whole.label == "cyclist"
     assert whole.rows == (0, 1)
     assert whole.box_px == (595.0, 150.0, 645.0, 265.0)
@@ -180,7 +182,7 @@ def test_near_people_give_heights_and_far_people_the_tilt() -> None:
     road, camera_m = SharedRoad(config), CAMERA.height_m
     places = [(x_m, y_m) for x_m in (6.5, 8.0, 11.0, 18.0, 28.0, 35.0) for y_m in (-2.0, 2.0)]
     boxes = [box_of(*place, 1.72 * math.exp(0.08), rise=0.02) for place in places]
-    seen = observe_people(found(boxes), CAMERA, CAMERA.ground, PeopleBoxesConfig())
+    seen = observe_people(found(boxes), CAMERA, CAMERA.ground, *BOXES)
     road.predict(1.0, 0.0, 0.02)
     road.add_people(len(seen))
     before = road.leave_one_out()

@@ -17,7 +17,7 @@ from birdslam.geometry.arrays import Bools, Floats
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.perception import Detections
 from birdslam.perception.decoding.detection import EdgeSigma
-from birdslam.vehicles.placement.localisation import iou
+from birdslam.vehicles.placement.localisation import LocalisationConfig, iou
 
 PEDESTRIAN, CYCLIST = "pedestrian", "cyclist"  # labels of records
 PERSON, BICYCLE, MOTORCYCLE = "person", "bicycle", "motorcycle"  # labels of detectors, which may also use "cyclist"
@@ -38,9 +38,7 @@ class PeopleBoxesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     sigma_edge_px: float = 0.5  # and a constant part
     sigma_covered_rel: float = 0.06  # additional, of a covered lower edge
     sigma_side_rel: float = 0.035  # of the middle column: swinging limbs
-    sigma_growth: float = 2.0  # as `LocalisationConfig.sigma_growth`
     sure_score: float = 0.85  # score above which the noise is not increased
-    cut_margin_px: float = 4.0  # distance to the border within which an edge counts as cut
     hidden: float = 0.003  # prior probability of hidden feet without a covering box
     hidden_covered: float = 0.03  # with a covering box
     hidden_cut: float = 0.8  # at the image border
@@ -75,7 +73,11 @@ class PersonBox:
 
 
 def observe_people(
-    detections: Detections, camera: Camera, ground: GroundPlane, config: PeopleBoxesConfig
+    detections: Detections,
+    camera: Camera,
+    ground: GroundPlane,
+    config: PeopleBoxesConfig,
+    localisation: LocalisationConfig,
 ) -> list[PersonBox]:
     """The people among the boxes of a frame, best score first: riders once, without occupants of cars.
 
@@ -102,6 +104,7 @@ def observe_people(
             sigma,
             camera,
             config,
+            localisation,
         )
         for i in order.tolist()
     ]
@@ -234,19 +237,21 @@ def _observe(
     stated: EdgeSigma | None,
     camera: Camera,
     config: PeopleBoxesConfig,
+    localisation: LocalisationConfig,
 ) -> PersonBox:
     x1, y1, x2, y2 = box.tolist()
     width_px, height_px = x2 - x1, y2 - y1
-    factor = 1.0 + config.sigma_growth * max(0.0, config.sure_score - score)
+    factor = 1.0 + localisation.sigma_growth * max(0.0, config.sure_score - score)
     rel = (config.sigma_edge_rel,) * 2 if stated is None else stated.rel[2:]
     px = config.sigma_edge_px if stated is None else stated.px
     upper, lower = (factor * math.hypot(height_px * max(r, config.sigma_edge_rel), px) / camera.fy_px for r in rel)
     if covered:
         lower = math.hypot(lower, height_px * config.sigma_covered_rel / camera.fy_px)
-    margin_px = config.cut_margin_px + 0.02 * height_px
+    cut_px = localisation.cut_margin_px
+    margin_px = cut_px + 0.02 * height_px
     cut_bottom = y2 > camera.height_px - margin_px
-    cut_top = y1 < config.cut_margin_px
-    is_cut_at_side = x1 < config.cut_margin_px or x2 > camera.width_px - config.cut_margin_px
+    cut_top = y1 < cut_px
+    is_cut_at_side = x1 < cut_px or x2 > camera.width_px - cut_px
     across = factor * math.hypot(height_px * config.sigma_side_rel, px) / camera.fx_px
     if is_cut_at_side:
         across = math.hypot(across, 0.5 * width_px / camera.fx_px)

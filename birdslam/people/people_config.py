@@ -74,9 +74,7 @@ class PeopleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     stop_mps: float = 0.08  # 1-sigma of the velocity of a standing person
     sigma_tilt_rad: float = 0.008  # of the road at a person relative to the ego, beyond the front end's sigma
     sigma_common_tilt_rad: float = 0.004  # of the common tilt under all people, beyond the front end's sigma
-    tilt_memory_s: float = 5.0  # correlation time of it, in driving time
     tilt_drift_rad: float = 0.003  # and its change within a second as people walk
-    driving_mps: float = 1.0  # as `GroundSizeConfig.driving_mps`
     sigma_roll_rad: float = 0.01  # of the front end's roll, per unit of y/x
     kerb_m: float = -0.03  # mean ground offset, negative on pavements
     sigma_kerb_m: float = 0.1  # 1-sigma of it

@@ -91,16 +91,17 @@ class PeopleFilter:
         T_world_ego: SE2,
         ego_cov: Floats | None,
         ground_shift_rad: float,
-        ego_mps: float,
+        driving: float,
+        keep_tilt: float,
         sigma_pitch_rad: float,
     ) -> None:
         """Predicts to the next frame; `ground_shift_rad` is the change of the ground's estimate beyond its motion.
 
-        `ego_cov` (3, 3) is the covariance of the ego's step in its tangent space.
+        `ego_cov` (3, 3) is the covariance of the ego's step in its tangent space, `driving` the driving fraction of a
+        second, `keep_tilt` the correlation of the road's tilt with that of the last frame.
         """
-        config, n = self.config, len(self._x)
-        self._driving = -math.expm1(-ego_mps / config.driving_mps)
-        keep = math.exp(-self._driving * dt_s / config.tilt_memory_s)
+        config, n, keep = self.config, len(self._x), keep_tilt
+        self._driving = driving
         self.road.predict(keep, ground_shift_rad, sigma_pitch_rad)
         if not n or dt_s <= 0.0:
             return

@@ -20,14 +20,14 @@ from birdslam.people.people_filter import PeopleFilter
 from birdslam.perception import Detections
 from birdslam.types import FIRST_PERSON
 from birdslam.vehicles.out_of_sequence import OpenFrame
-from birdslam.vehicles.placement.localisation import iou
+from birdslam.vehicles.placement.localisation import LocalisationConfig, iou
 from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
+from birdslam.vehicles.track import TrackingConfig
 
 IMPOSSIBLE_COST = 1e9
 NEW_PER_S = 1.0  # rate of new people, per unit of bearing, slope and log height
 MIN_DT_S = 1e-3
 SIDE_MARGIN = 0.03  # of the image width, beyond which a person has left
-UNKNOWN_MPS = 10.0  # ego speed without odometry
 MAX_OUTSIDE_S = 0.3  # until a person outside the image is removed
 
 SHAPE_DOF = 3.0  # of Student's t
@@ -39,10 +39,7 @@ class PeopleTrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
     """Parameters of association and of tracks."""
 
     gate: float = 16.3  # squared Mahalanobis distance of bearing, bottom and top: 99.9 % of three
-    birth_score: float = 0.5  # minimum score of a box to start a track
     birth_iou: float = 0.55  # maximum overlap with a tracked box to start a track
-    confirm_hits: int = 2  # number of observations until a track gets its id
-    forget_unconfirmed_s: float = 0.25  # without a box, before the id
     forget_s: float = 1.5  # without a box, with an id
     seen_for_s: float = 1.1  # mean time until a person has no box
     hidden_for_s: float = 0.65  # mean time until the box returns
@@ -86,12 +83,22 @@ class PeopleTracker:
     The road is the front end's ground in that frame, with its vertical curvature.
     """
 
-    def __init__(self, camera: Camera, config: PeopleTrackingConfig, first_id: int = FIRST_PERSON) -> None:
+    def __init__(
+        self,
+        camera: Camera,
+        config: PeopleTrackingConfig,
+        tracking: TrackingConfig,
+        localisation: LocalisationConfig,
+        first_id: int = FIRST_PERSON,
+    ) -> None:
+        """`tracking` and `localisation` are those of vehicles, for what both have in common."""
         from scipy.optimize import linear_sum_assignment  # lazy: 9 MB that only the tracking process needs
 
         self._assign = linear_sum_assignment
         self.camera = camera
         self.config = config
+        self.tracking = tracking
+        self.localisation = localisation
         self.filter = PeopleFilter(config.people)
         self.tracks: list[PersonTrack] = []
         self.frame: OpenFrame | None = None  # last settled frame
@@ -105,7 +112,7 @@ class PeopleTracker:
         self._predict(frame, road)
         self.frame = frame
         if detections is not None:
-            boxes = observe_people(detections, self.camera, ground, self.config.boxes)
+            boxes = observe_people(detections, self.camera, ground, self.config.boxes, self.localisation)
             pairs = self._associate(boxes, frame, profile)
             rows = [row for row, _ in pairs]
             self.filter.correct(rows, [boxes[k] for _, k in pairs], ego.T_world_ego, profile)
@@ -122,8 +129,11 @@ class PeopleTracker:
         ego, pitch_rad = frame.ego, road.ground.pitch_rad
         shift_rad = 0.0 if self._pitch_rad is None else pitch_rad - self._pitch_rad - (frame.turn_rad or 0.0)
         self._pitch_rad = pitch_rad
-        ego_mps = UNKNOWN_MPS if frame.travelled_m is None else frame.travelled_m / max(frame.dt_s, 1e-3)
-        self.filter.predict(frame.dt_s, ego.T_world_ego, ego.step_cov, shift_rad, ego_mps, road.sigma_pitch_rad)
+        driving = road.driving_share(frame.dt_s, frame.travelled_m)
+        keep_tilt = math.exp(-driving * frame.dt_s / road.config.tilt_memory_s)
+        self.filter.predict(
+            frame.dt_s, ego.T_world_ego, ego.step_cov, shift_rad, driving, keep_tilt, road.sigma_pitch_rad
+        )
 
     def _associate(self, boxes: Sequence[PersonBox], frame: OpenFrame, road: RoadProfile) -> list[tuple[int, int]]:
         """Pairs (row, box) of least total cost, -2 log likelihood within the gate."""
@@ -188,7 +198,7 @@ class PeopleTracker:
         followed = np.array([boxes[k].box_px for k in matched]).reshape(-1, 4)
         births: list[int] = []
         for k, box in enumerate(boxes):
-            if k in matched or box.label == BICYCLE or box.score < self.config.birth_score:
+            if k in matched or box.label == BICYCLE or box.score < self.tracking.birth_score:
                 continue
             if len(followed) and iou(np.array([box.box_px]), followed).max() > self.config.birth_iou:
                 continue
@@ -211,9 +221,9 @@ class PeopleTracker:
             x_m, y_m = at[row].tolist()
             outside = x_m < 1.0 or abs(y_m) > edge * x_m
             track.outside_s = track.outside_s + frame.dt_s if outside and track.seen_ns != ego.t_source_ns else 0.0
-            lasting = track.hits >= self.config.confirm_hits
+            lasting = track.hits >= self.tracking.confirm_hits
             unseen_s = (ego.t_source_ns - track.seen_ns) * 1e-9
-            limit_s = self.config.forget_s if lasting else self.config.forget_unconfirmed_s
+            limit_s = self.config.forget_s if lasting else self.tracking.forget_unconfirmed_s
             if unseen_s <= limit_s and track.outside_s <= MAX_OUTSIDE_S and math.isfinite(x_m + y_m):
                 alive.append((math.hypot(x_m, y_m), row))
         rows = sorted(row for _, row in sorted(alive)[: self.config.most])
@@ -222,7 +232,7 @@ class PeopleTracker:
             self.filter.keep_rows(rows, [row for row in sorted(gone) if self.tracks[row].person >= 0])
             self.tracks = [self.tracks[row] for row in rows]
         for track, standing in zip(self.tracks, moments.standing[rows].tolist(), strict=True):
-            if track.person < 0 and track.hits >= self.config.confirm_hits:
+            if track.person < 0 and track.hits >= self.tracking.confirm_hits:
                 track.person, self.next_id = self.next_id, self.next_id + 1
             track.is_stationary = standing > (
                 MIN_STAY_PROBABILITY if track.is_stationary else MIN_STATIONARY_PROBABILITY

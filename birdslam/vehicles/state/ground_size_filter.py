@@ -171,7 +171,7 @@ class GroundSizeFilter:
         curvature by lanes, or None.
         """
         config = self.config
-        share = 1.0 if travelled_m is None else self._driving_share(travelled_m / max(dt_s, _MIN_DT_S))
+        share = self.driving_share(dt_s, travelled_m)
         self._unseen_s = self._unseen_s + dt_s
         self._driven_s = self._driven_s + share * dt_s
         self._x[PITCH] += turn_rad or 0.0
@@ -271,9 +271,11 @@ class GroundSizeFilter:
         out: Floats = config.width_drift_rel**2 + config.width_turn_rel**2 * (np.square(turned_rad) + own_var)
         return out
 
-    def _driving_share(self, speed_mps: float) -> float:
-        """Driving fraction of a second."""
-        return -math.expm1(-speed_mps / self.config.driving_mps)
+    def driving_share(self, dt_s: float, travelled_m: float | None) -> float:
+        """Driving fraction of a step of the ego; a step of unknown length is treated as driving."""
+        if travelled_m is None:
+            return 1.0
+        return -math.expm1(-travelled_m / max(dt_s, _MIN_DT_S) / self.config.driving_mps)
 
     def _correlated_frames(self, rows: Sequence[int], learned: LearnedSize | None) -> Floats:
         """(N,) number of consecutive frames with the same error, from the change of view since the last observation.
