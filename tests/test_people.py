@@ -56,13 +56,17 @@ HZ = 10.0
 def box_of(
     x_m: float, y_m: float, height_m: float = 1.72, width_m: float = 0.6, reach_m: float = 0.25, rise: float = 0.0
 ) -> Box:
-    """Of somebody at a place in ego, over a level road or one that rises; the feet reach out to the camera."""
+    """Of somebody at a place in ego, over a level road or one that rises; the feet reach out to the camera.
+
+    With the margins of a detector.
+    """
     near_m = x_m - reach_m
     points = np.array([[near_m, y_m, rise * near_m], [x_m, y_m, rise * x_m + height_m]])
     foot, head = bev.ego_to_pixel(CAMERA, CAMERA.ground, points)
     middle = bev.ego_to_pixel(CAMERA, CAMERA.ground, np.array([[x_m, y_m, 0.0]]))[0, 0]
-    half = width_m / x_m * CAMERA.fx_px / 2.0
-    return float(middle - half), float(head[1]), float(middle + half), float(foot[1])
+    half, tall, sizes = width_m / x_m * CAMERA.fx_px / 2.0, foot[1] - head[1], PeopleConfig().pedestrian
+    top, bottom = head[1] - sizes.head_rel * tall, foot[1] + sizes.foot_rel * tall
+    return float(middle - half), float(top), float(middle + half), float(bottom)
 
 
 def found(boxes: list[Box], labels: list[str] | None = None, score: float = 0.9) -> Detections:

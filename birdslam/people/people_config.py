@@ -27,6 +27,8 @@ class Sizes(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sigma_beside_mps: float  # 1-sigma of the velocity across the road
     crossing_mps: float  # 1-sigma of the velocity in any direction
     change_mps: float  # 1-sigma of the change of velocity within a second
+    foot_rel: float = 0.0  # mean margin of boxes below the feet, of the height
+    head_rel: float = 0.0  # and above the head
 
 
 class PeopleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -48,6 +50,8 @@ class PeopleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         sigma_beside_mps=0.25,
         crossing_mps=1.1,
         change_mps=0.5,
+        foot_rel=0.005,
+        head_rel=0.02,
     )
     cyclist: Sizes = Sizes(  # with the rider
         height_m=1.74,
@@ -76,8 +80,7 @@ class PeopleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sigma_common_tilt_rad: float = 0.004  # of the common tilt under all people, beyond the front end's sigma
     tilt_drift_rad: float = 0.003  # and its change within a second as people walk
     sigma_roll_rad: float = 0.01  # of the front end's roll, per unit of y/x
-    kerb_m: float = -0.03  # mean ground offset, negative on pavements
-    sigma_kerb_m: float = 0.1  # 1-sigma of it
+    sigma_kerb_m: float = 0.1  # 1-sigma of the ground offset under a person
     sigma_pavement_rel: float = 0.036  # common part of it, of the camera height: 0.06 m
     hidden_share: float = 0.3  # mean hidden fraction of the height with hidden feet
     sigma_hidden_share: float = 0.35  # 1-sigma of it

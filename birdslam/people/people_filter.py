@@ -68,7 +68,7 @@ class PeopleFilter:
         self._weight = np.zeros((0, FILTERS))
         self._unseen_s = np.zeros(0)
         self._log_height = np.zeros((0, FILTERS))  # of adults and children
-        self._sizes = np.zeros((0, 4))  # reach, change, log width, sigma width
+        self._sizes = np.zeros((0, 6))  # reach, change, log width, sigma width, mean errors of foot and head
         self._moves = np.zeros((0, len(MOTIONS), 3))  # speed along the road, its 1-sigma, 1-sigma across the road
         # Mean and variance of common tilt and log height from the others, and variances of the own parts
         self._shared, self._own_var = np.zeros((0, 2, 2)), np.zeros((0, FILTERS, 2))
@@ -118,8 +118,9 @@ class PeopleFilter:
         self._P[..., TILT, TILT] += ((1.0 - keep**2) * (var + config.sigma_tilt_rad**2))[:, None]
         self._P[..., TILT, TILT] += config.tilt_drift_rad**2 * dt_s
         keep = math.exp(-dt_s / config.outline_memory_s)
-        for state in (FOOT, HEAD):
-            self._x[..., state] *= keep
+        for k, state in enumerate((FOOT, HEAD)):
+            mean = self._sizes[:, 4 + k, None]
+            self._x[..., state] = mean + keep * (self._x[..., state] - mean)
             self._P[..., state, :] *= keep
             self._P[..., state] *= keep
             self._P[..., state, state] += (1.0 - keep**2) * config.sigma_outline_rel**2
@@ -136,7 +137,7 @@ class PeopleFilter:
             return
         config, n, before, shared = self.config, len(boxes), len(self._x), self.road.leave_one_out()[-1]
         x, P = np.zeros((n, FILTERS, len(STATES))), np.zeros((n, FILTERS, len(STATES), len(STATES)))
-        weight, rows = np.zeros((n, FILTERS)), np.zeros((n, 4))
+        weight, rows = np.zeros((n, FILTERS)), np.zeros((n, 6))
         log_height = np.zeros((n, FILTERS))
         moves, own_var = np.zeros((n, len(MOTIONS), 3)), np.zeros((n, FILTERS, 2))
         for k, box in enumerate(boxes):
@@ -144,7 +145,8 @@ class PeopleFilter:
             moves[k] = motion_parameters(sizes, config)
             own_var[k, :, 0] = config.sigma_tilt_rad**2 + (config.sigma_roll_rad * box.bearing) ** 2
             rows[k] = [
-                sizes.reach_m, sizes.change_mps, math.log(sizes.width_m), sizes.sigma_width_rel
+                sizes.reach_m, sizes.change_mps, math.log(sizes.width_m), sizes.sigma_width_rel,
+                sizes.foot_rel, -sizes.head_rel,
             ]  # fmt: skip
             for child, (h_m, sigma) in enumerate(
                 ((sizes.height_m, sizes.sigma_height_rel), (sizes.child_m, sizes.sigma_child_rel))
@@ -153,11 +155,12 @@ class PeopleFilter:
                 both = slice(len(MOTIONS) * child, len(MOTIONS) * (child + 1))
                 x[k, both, :2] = T_world_ego @ np.array([x_m, box.bearing * x_m])
                 log_height[k, both] = math.log(h_m)
-                x[k, both, HEIGHT], x[k, both, OFFSET] = math.log(h_m) + shared[1, 0], config.kerb_m
+                x[k, both, HEIGHT] = math.log(h_m) + shared[1, 0]
                 P[k, both, :2, :2] = np.eye(2) * (INITIAL_DEPTH_SIGMA_REL * x_m) ** 2
                 own_var[k, both, 1] = config.own_height_var(sigma)
                 weight[k, both] = (sizes.child if child else 1.0 - sizes.child) * motion_priors(config)
             x[k, :, TILT] = shared[0, 0]
+            x[k, :, FOOT], x[k, :, HEAD] = sizes.foot_rel, -sizes.head_rel
             P[k, :, [TILT, HEIGHT], [TILT, HEIGHT]] = (shared[:, 1] + own_var[k]).T
             P[k, :, [FOOT, HEAD], [FOOT, HEAD]] = config.sigma_outline_rel**2
             P[k, :, OFFSET, OFFSET] = config.sigma_kerb_m**2

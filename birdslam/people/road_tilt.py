@@ -32,8 +32,10 @@ def make_samples(boxes: Sequence[PersonBox], road: RoadProfile, config: PeopleCo
         if not box.is_complete or box.hidden > config.sure_feet or box.tan_height <= MIN_SLOPE:
             continue
         sizes = config.sizes(box.label)
-        depth = sizes.height_m / box.tan_height
-        tilt = road.slope(max(depth - sizes.reach_m, MIN_DISTANCE_M), config.kerb_m) - box.slope_bottom
+        tall = box.tan_height / (1.0 + sizes.foot_rel + sizes.head_rel)
+        depth = sizes.height_m / tall
+        bottom = box.slope_bottom - sizes.foot_rel * tall
+        tilt = road.slope(max(depth - sizes.reach_m, MIN_DISTANCE_M)) - bottom
         slope = road.height_m / depth
         of_size = config.own_height_var(sizes.sigma_height_rel) + (2.0 * config.sigma_outline_rel) ** 2
         variance = slope**2 * of_size + (config.sigma_kerb_m / depth) ** 2
