@@ -36,9 +36,9 @@ class ConstantVelocity(Factor):
         """Sets the growth of the twists' variances for this frame, and the rows of stationary vehicles."""
         frame.twist_growth, nodes = self._growth, frame.vehicles.nodes
         fixed = [row for row, v in enumerate(nodes) if v.moves is Moves.STANDING and not v.in_path]
-        if begun := [row for row in fixed if not nodes[row].is_fixed]:
-            still = np.zeros(len(begun))
-            window.set_twists(begun, still, still, np.tile(np.diag(self._growth), (len(begun), 1, 1)))
+        if started := [row for row in fixed if not nodes[row].is_fixed]:
+            still = np.zeros(len(started))
+            window.set_twists(started, still, still, np.tile(np.diag(self._growth), (len(started), 1, 1)))
         for row, v in enumerate(nodes):
             v.is_fixed = row in fixed
         frame.fixed = fixed
