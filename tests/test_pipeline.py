@@ -313,13 +313,20 @@ def test_a_slow_reader_costs_dropped_frames_that_are_counted(drive: Path, place:
     assert summary["statuses"]["frames_dropped"] > 0
 
 
+def measured(planner: Planner) -> Estimate:
+    """The next measured estimate. On a busy computer a frame has a prediction first, and then its measurement."""
+    while True:
+        estimate = planner.wait(LIMIT_S)
+        assert estimate is not None
+        if Status.PERCEPTION_LATE not in estimate.status:
+            return estimate
+
+
 def test_planner_second_instance_and_interrupt(drive: Path, place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     begun_ns = time.monotonic_ns()
     with Run(place, "--source", f"kitti:{drive}", "--set", "source.loop=true") as run:
         with Planner(run.vehicle, run.runtime_dir) as planner:
-            first, second = planner.wait(LIMIT_S), planner.wait(LIMIT_S)
-            assert first is not None
-            assert second is not None
+            first, second = measured(planner), measured(planner)
             assert second.frame_id > first.frame_id
             reading = planner.latest(max_age_ms=1e3 * LIMIT_S)
             assert reading.alive
