@@ -60,7 +60,6 @@ REMEDIES: Mapping[Status, str] = {
 }
 MAX_SIGMA_REL = 0.04  # a tape measure or a data sheet is more accurate
 MIN_REMEDY_SHARE = 0.2  # of the frames
-MIN_STATIONARY_SHARE = 0.4  # of a drive without a valid frame
 REPORTED = (Status.CALIBRATION_DRIFT, Status.SCALE_ESTIMATED, Status.VIEW_OBSTRUCTED, Status.STANDSTILL)
 
 
@@ -156,7 +155,7 @@ def _next_steps(drive: DriveCounts) -> Iterable[str]:
         if sigma_rel > MAX_SIGMA_REL:
             yield f"Next: {words}"
     stationary = drive.statuses.get(Status.STANDSTILL.value, 0)
-    if drive.invalid_frames == drive.frames and stationary > MIN_STATIONARY_SHARE * drive.frames:
+    if drive.invalid_frames == drive.frames < 2 * stationary:  # most frames
         yield "The camera hardly moves. Without motion there is no scale and no trajectory: film from a moving car."
         return
     for status, remedy in REMEDIES.items():

@@ -70,10 +70,7 @@ def pixels(image: Any) -> NDArray[np.uint8]:
     rows = data[: height_px * row].reshape(height_px, row)[:, : width_px * channels]
     shape = (height_px, width_px) if channels == 1 else (height_px, width_px, channels)
     out = np.ascontiguousarray(rows).reshape(shape)
-    try:
-        return out if conversion is None else cv2.cvtColor(out, conversion)  # type: ignore[return-value]
-    except cv2.error:  # too small for a Bayer mosaic or for pairs of pixels
-        raise ValueError(f"{width_px}x{height_px} is not a valid image size in {image.encoding}") from None
+    return out if conversion is None else _converted(out, image.encoding)
 
 
 def demosaiced(stored_as: str, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -84,9 +81,17 @@ def demosaiced(stored_as: str, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     encoding = stored_as.partition(";")[0].strip()
     if image.ndim != 2 or not encoding.startswith("bayer_"):
         return image
-    if encoding not in ENCODINGS or min(image.shape) < 4:
-        raise ValueError(f"encoding {encoding!r} of {image.shape[1]}x{image.shape[0]} px is not supported")
-    return cv2.cvtColor(image, ENCODINGS[encoding][1])  # type: ignore[return-value, arg-type]
+    if encoding not in ENCODINGS:
+        raise ValueError(f"encoding {encoding!r} is not one of {', '.join(ENCODINGS)}")
+    return _converted(image, encoding)
+
+
+def _converted(stored: NDArray[np.uint8], encoding: str) -> NDArray[np.uint8]:
+    """The BGR image of an image in one of ENCODINGS. Raises ValueError."""
+    try:
+        return cv2.cvtColor(stored, ENCODINGS[encoding][1])  # type: ignore[return-value, arg-type]
+    except cv2.error:  # too small for a Bayer mosaic or for pairs of pixels
+        raise ValueError(f"{stored.shape[1]}x{stored.shape[0]} is not a valid image size in {encoding}") from None
 
 
 def lens(info: Any, rectified: bool) -> Lens:

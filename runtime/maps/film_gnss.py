@@ -19,8 +19,7 @@ import msgspec
 import numpy as np
 
 from birdslam.loops.gnss.earth import is_on_earth
-from birdslam.loops.gnss.files import MAX_BYTES, GnssError
-from birdslam.loops.gnss.subtitles import subtitle_fixes
+from birdslam.loops.gnss.files import GnssError, read_fixes
 from birdslam.outputs.earth_files import GeoLine, write_geo_lines
 from birdslam.types import NS_PER_S
 
@@ -94,16 +93,17 @@ def track_of_films(films: Sequence[Path], path: Path) -> int:
 
 
 def fixes_beside(film: Path) -> list[FilmFix]:
-    """Reads the fixes in the subtitles beside a film, FILM.srt. Raises GnssError."""
+    """Reads the fixes in the subtitles beside a film, FILM.srt; none from subtitles without positions."""
     path = next((path for suffix in (".srt", ".SRT") if (path := film.with_suffix(suffix)).is_file()), None)
     if path is None:
         return []
     try:
-        text = path.read_bytes()[:MAX_BYTES].decode("utf-8-sig", errors="replace")
+        fixes = read_fixes(path.read_bytes(), path.name, 0)
     except OSError as error:
         raise GnssError(f"{path}: can't be read: {error.strerror}") from None
-    fixes = (FilmFix(latitude, longitude, None, t_s) for _, (t_s, latitude, longitude, *_) in subtitle_fixes(text))
-    return [fix for fix in fixes if is_on_earth(fix.latitude_deg, fix.longitude_deg) and fix.latitude_deg]
+    except GnssError:
+        return []
+    return [FilmFix(fix.latitude_deg, fix.longitude_deg, None, fix.t_source_ns / NS_PER_S) for fix in fixes]
 
 
 def _fix(sample: dict[str, Any]) -> FilmFix | None:
