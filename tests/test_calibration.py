@@ -24,7 +24,7 @@ from birdslam.calibration.calibration import (
     calibrate,
 )
 from birdslam.calibration.camera_files import read_intrinsics
-from birdslam.calibration.height_check import HeightCheck, VehicleHeightConfig, solve_mounting
+from birdslam.calibration.height_check import HeightCheck, VehicleHeightConfig, checks_by_vehicles, solve_mounting
 from birdslam.calibration.intrinsics import from_chessboard
 from birdslam.calibration.lane_width import LaneWidth, checks_by_lanes, painted_width_m
 from birdslam.calibration.readout import PRIOR
@@ -34,8 +34,8 @@ from birdslam.lanes.ego_lane import EgoLane
 from birdslam.odometry.road.fit import RoadFit
 from birdslam.outputs.plain_words import DriveCounts, LengthsBy, verdict
 from birdslam.perception import Perception, Ready
-from birdslam.runtime.calibration.given import lane_width_of
-from birdslam.runtime.calibration.height import lengths_by, with_height
+from birdslam.runtime.calibration.given import known_length_of
+from birdslam.runtime.calibration.height import check_sigma_rel, lengths_by, with_height
 from birdslam.runtime.cli.main import main
 from birdslam.runtime.configuration import ConfigurationError
 from birdslam.sources.camera_file import camera_text, load_camera
@@ -483,11 +483,36 @@ def test_a_known_lane_width_sets_the_height(width_m: float) -> None:
     assert known.sigma_m / known.height_m < 0.5 * usual.sigma_m / usual.height_m
 
 
-@pytest.mark.parametrize("text", ["3.5", "lane", "lane=", "lane=nan", "lane=60", "car=4.4x1.8x1.45"])
+@pytest.mark.parametrize("height_m", [1.2, 1.45, 2.9])
+def test_a_vehicle_of_known_size_sets_the_height(height_m: float) -> None:
+    """The height is proportional to the vehicle's; vehicles with fewer boxes have no effect."""
+    rng = np.random.default_rng(5)
+    camera = Camera(1280, 720, 1100.0, 1100.0, 639.5, 359.5, 1.5)
+    boxes = [
+        BoxHeight(vehicle, 1.4 / z, 0.002, tall_m / z, 0.002, 0.0, 1.53, 0.08)
+        for vehicle, tall_m, frames in ((1, height_m, 60), (2, 1.9, 20), (3, 1.2, 30))
+        for z in rng.uniform(8.0, 15.0, frames)
+    ]
+    (known,) = checks_by_vehicles(boxes, camera, np.diag([0.003, 0.01]) ** 2, VehicleHeightConfig(), height_m)
+    assert known.height_m == pytest.approx(1.4, abs=known.sigma_m)
+    assert known.sigma_m < 0.14  # from the pitch, the ground below the vehicle and the margin of its boxes
+    assert check_sigma_rel(known) == known.sigma_m / known.height_m  # without the spread between countries
+    assert checks_by_vehicles(boxes, camera, np.diag([0.003, 0.01]) ** 2, VehicleHeightConfig()) == []
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["3.5", "lane", "lane=", "lane=nan", "lane=60", "lane=3x2", "car=4.4x1.8", "car=4.4x1.8x9", "bus=3", "car=x"],
+)
 def test_unusable_known_length_is_refused(text: str) -> None:
     with pytest.raises(ConfigurationError, match="expected lane=METRES"):
-        lane_width_of(text)
-    assert lane_width_of("lane=3.5") == 3.5
+        known_length_of(text)
+
+
+def test_known_lengths_are_of_lanes_or_of_a_vehicle() -> None:
+    assert known_length_of("lane=3.5") == {"lane_m": 3.5}
+    assert known_length_of("car=4.4x1.8x1.45") == {"car_height_m": 1.45}
+    assert known_length_of(None) == {}
 
 
 def test_sigma_of_a_film_includes_readout_time() -> None:

@@ -67,6 +67,7 @@ class CalibrationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     restart_rad: Positive = 0.01  # max. distance from the initial tilt; above it the drive is repeated from the result
     max_drives: Annotated[int, msgspec.Meta(ge=1)] = 3
     known_lane_m: Positive | None = None  # width of the drive's lanes, if stated
+    known_vehicle_m: Positive | None = None  # height of the vehicle that is in view for most frames, if stated
 
 
 class CueEstimate(msgspec.Struct, frozen=True, kw_only=True):
@@ -172,7 +173,7 @@ def calibrate(
         estimates=estimates,
         height_checks=(
             *checks_by_length(lengths or {}, seen.steps, seen.times_ns, camera, config.height),
-            *checks_by_vehicles(seen.boxes, camera, cov, config.vehicles),
+            *checks_by_vehicles(seen.boxes, camera, cov, config.vehicles, config.known_vehicle_m),
             *checks_by_lanes(seen.lanes, camera.height_m, float(sigma[0]), config.known_lane_m),
         ),
         yaw_rad=_yaw_rad(seen),

@@ -7,8 +7,9 @@ The camera height defines the metric scale, so images alone cannot check it. Kno
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import msgspec
@@ -25,7 +26,9 @@ from birdslam.vehicles.camera_height import (
     own_variance,
 )
 
-VEHICLES, LANES = "vehicles", "lanes"  # cues by size
+VEHICLES, LANES, KNOWN_VEHICLE = "vehicles", "lanes", "known vehicle"  # cues by size
+_MIN_SIGMA_REL = 1e-3  # of a stated height
+_KNOWN_SIGMA_REL = 0.03  # of the height from a vehicle of known size: boxes are a few per cent too large or too small
 Floats = NDArray[np.float64]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 Step = tuple[int, int, float]  # from frame, to frame, length measured by the odometry
@@ -82,9 +85,20 @@ def checks_by_length(
 
 
 def checks_by_vehicles(
-    boxes: Sequence[BoxHeight], camera: Camera, cov: Floats, config: VehicleHeightConfig
+    boxes: Sequence[BoxHeight],
+    camera: Camera,
+    cov: Floats,
+    config: VehicleHeightConfig,
+    known_height_m: float | None = None,
 ) -> list[HeightCheck]:
-    """One check, or none with too few vehicles; `cov` (2, 2) of pitch and roll."""
+    """One check, or none with too few vehicles; `cov` (2, 2) of pitch and roll.
+
+    `known_height_m` is the stated height of the vehicle with the most boxes, which then is the only one.
+    """
+    cue = VEHICLES
+    if known_height_m is not None and boxes:
+        cue, boxes = KNOWN_VEHICLE, _boxes_of_known(boxes, known_height_m)
+        config = msgspec.structs.replace(config, sigma_class_rel=_KNOWN_SIGMA_REL, min_vehicles=1, gate_sigma=math.inf)
     prior = np.array([camera.height_m, camera.pitch_rad, camera.roll_rad])
     prior_cov = np.zeros((3, 3))
     prior_cov[0, 0] = (0.5 * camera.height_m) ** 2
@@ -93,7 +107,13 @@ def checks_by_vehicles(
     if mounting is None:
         return []
     sigma_m = float(np.sqrt(mounting.cov[0, 0]))
-    return [HeightCheck(cue=VEHICLES, height_m=float(mounting.state[0]), sigma_m=sigma_m, samples=mounting.vehicles)]
+    return [HeightCheck(cue=cue, height_m=float(mounting.state[0]), sigma_m=sigma_m, samples=mounting.vehicles)]
+
+
+def _boxes_of_known(boxes: Sequence[BoxHeight], height_m: float) -> list[BoxHeight]:
+    """Boxes of the vehicle that has most of them, with its stated height."""
+    known, _ = Counter(box.vehicle for box in boxes).most_common(1)[0]
+    return [replace(box, height_m=height_m, sigma_height_rel=_MIN_SIGMA_REL) for box in boxes if box.vehicle == known]
 
 
 def solve_mounting(

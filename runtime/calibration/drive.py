@@ -9,7 +9,7 @@ import cv2
 import msgspec
 
 from birdslam.calibration.calibration import Calibration, CalibrationConfig, CalibrationError, calibrate
-from birdslam.calibration.height_check import LANES
+from birdslam.calibration.height_check import KNOWN_VEHICLE, LANES
 from birdslam.calibration.intrinsics import Intrinsics
 from birdslam.calibration.lane_width import MIN_DISTANCE_M
 from birdslam.calibration.lens_windows import CornersOfImage
@@ -88,7 +88,7 @@ def calibrate_drive(
     known_height = height_m is not None or lens is None  # a recording with its own calibration has the height
     cv2.setNumThreads(configuration.perceive.opencv_threads)
     configuration = configuration.as_lossless()
-    config = msgspec.structs.replace(config, known_lane_m=given.lane_m)
+    config = msgspec.structs.replace(config, known_lane_m=given.lane_m, known_vehicle_m=given.car_height_m)
     with Inference(configuration) as inference:
 
         def drive() -> Iterator[tuple[Frame, Pending]]:
@@ -105,6 +105,8 @@ def calibrate_drive(
             found = _assumed(recording.camera, pitch, str(error))
     if given.lane_m is not None and not any(check.cue == LANES for check in found.height_checks):
         raise CalibrationError(f"{uri}: --known-length lane: less than {MIN_DISTANCE_M:g} m between two painted lines")
+    if given.car_height_m is not None and not any(check.cue == KNOWN_VEHICLE for check in found.height_checks):
+        raise CalibrationError(f"{uri}: --known-length car: the drive shows no vehicle well enough")
     camera, height_by = with_height(found, known_height, lens, uri, readout)
     return Calibrated(
         camera,

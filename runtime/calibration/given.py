@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -39,20 +38,26 @@ class Given:
     kind: str = "dashcam"  # kind of camera, if the field of view is unknown too
     speed: Path | None = None  # lines of time in s, speed in m/s
     lane_m: float | None = None  # width of the drive's lanes
+    car_height_m: float | None = None  # of the vehicle that is in view for most frames
 
 
-def lane_width_of(text: str | None) -> float | None:
-    """Parses `--known-length lane=3.5`. Raises ConfigurationError."""
+def known_length_of(text: str | None) -> dict[str, float]:
+    """Parses `--known-length`, `lane=3.5` or `car=4.4x1.8x1.45`, to a field of `Given`. Raises ConfigurationError."""
     if text is None:
-        return None
-    what, _, number = text.partition("=")
+        return {}
+    what, _, numbers = text.partition("=")
     try:
-        width_m = float(number)
+        sizes_m = [float(number) for number in numbers.split("x")]
     except ValueError:
-        width_m = math.nan
-    if what != "lane" or not 2.0 <= width_m <= 6.0:
-        raise ConfigurationError(f"--known-length {text}: expected lane=METRES, a width of 2 to 6 m")
-    return width_m
+        sizes_m = []
+    if what == "lane" and len(sizes_m) == 1 and 2.0 <= sizes_m[0] <= 6.0:
+        return {"lane_m": sizes_m[0]}
+    if what == "car" and len(sizes_m) in (1, 3) and 1.0 <= sizes_m[-1] <= 4.5:
+        return {"car_height_m": sizes_m[-1]}
+    raise ConfigurationError(
+        f"--known-length {text}: expected lane=METRES, a width of 2 to 6 m, or car=LENGTHxWIDTHxHEIGHT, "
+        "a height of 1 to 4.5 m"
+    )
 
 
 def lens_of(given: Given, uri: str, topics: BagTopics) -> tuple[Intrinsics | None, float | None]:

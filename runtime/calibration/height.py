@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from birdslam.calibration.calibration import Calibration, CalibrationError
-from birdslam.calibration.height_check import LANES, VEHICLES, HeightCheck, KnownLength
+from birdslam.calibration.height_check import KNOWN_VEHICLE, LANES, VEHICLES, HeightCheck, KnownLength
 from birdslam.calibration.intrinsics import Intrinsics
 from birdslam.calibration.readout import Readout
 from birdslam.geometry.camera import Camera
@@ -24,7 +24,11 @@ UNKNOWN_HEIGHT_M = 1.5  # placeholder: all lengths are proportional to it, and i
 COUNTRY_SIGMA_REL = 0.08  # of the height from the size of cars, which differs between countries (docs/calibration.md)
 WINDSCREEN_M, WINDSCREEN_SIGMA_REL = 1.35, 0.2  # prior: behind a car's windscreen, 1.1 to 1.6 m; by judgement
 AGREES_SIGMA = 2.0
-SIZES = (VEHICLES, LANES)  # cues for the height alone; the others constrain height and focal length together
+SIZES = (
+    VEHICLES,
+    LANES,
+    KNOWN_VEHICLE,
+)  # cues for the height alone; the others constrain height and focal length together
 _SHUTTER_PER_M2 = 0.066  # docs/constants.md
 
 
@@ -148,7 +152,7 @@ def _cue_name(check: HeightCheck) -> str:
     """Returns the name of a cue for the report."""
     if check.cue == VEHICLES:
         return f"the size of {check.samples} cars"
-    return "the width of lanes" if check.cue == LANES else f"the {check.cue}"
+    return {LANES: "the width of lanes", KNOWN_VEHICLE: "the vehicle of known size"}.get(check.cue, f"the {check.cue}")
 
 
 def focal_sigma_rel(lens: Intrinsics | None) -> float:

@@ -116,6 +116,9 @@ def add_lens(parser: argparse.ArgumentParser) -> None:
     """Adds the field of view of a film without a camera file."""
     text = "horizontal field of view, for a film whose metadata do not have it"
     parser.add_argument("--fov", type=float, metavar="DEG", help=text)
-    text = "width of the drive's lanes between the middles of their lines; sets the scale of a film without --height"
+    text = (
+        "width of the drive's lanes between the middles of their lines, or size of the vehicle that is in view for "
+        "most frames, car=LxWxH; sets the scale of a film without --height"
+    )
     parser.add_argument("--known-length", metavar="lane=M", help=text)
     parser.add_argument("--kind", choices=("dashcam", "phone"), default="dashcam", help="if --fov is unknown")

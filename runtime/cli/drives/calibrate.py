@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 from birdslam.runtime.calibration.drive import calibrate_drive
-from birdslam.runtime.calibration.given import Given, lane_width_of
+from birdslam.runtime.calibration.given import Given, known_length_of
 from birdslam.runtime.calibration.report import write_camera_file
 from birdslam.runtime.cli.arguments import add_config, add_lens, add_settings, add_topics
 from birdslam.runtime.configuration import ConfigurationError
@@ -52,7 +52,7 @@ def run(options: argparse.Namespace) -> int:
         fov_deg=options.fov,
         kind=options.kind,
         speed=options.known_speed,
-        lane_m=lane_width_of(options.known_length),
+        **known_length_of(options.known_length),
     )
     found = calibrate_drive(configuration_of(options), options.source, given, options.stride or 1)
     write_camera_file(Path(options.output), found.camera, found.report)

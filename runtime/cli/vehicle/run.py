@@ -157,7 +157,7 @@ def _calibrated(
     """
     # A late import: it loads the whole front end
     from birdslam.runtime.calibration.drive import ROUGH, calibrate_drive
-    from birdslam.runtime.calibration.given import Given, lane_width_of
+    from birdslam.runtime.calibration.given import Given, known_length_of
     from birdslam.runtime.calibration.report import write_camera_file
 
     source = configuration.source
@@ -177,7 +177,7 @@ def _calibrated(
         fov_deg=options.fov,
         kind=options.kind,
         speed=speed,
-        lane_m=lane_width_of(options.known_length),
+        **known_length_of(options.known_length),
     )
     found = calibrate_drive(configuration, source.uri, given, source.stride, ROUGH, must_show=False)
     path = Path(configuration.output) / "camera.toml"
