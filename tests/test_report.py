@@ -16,14 +16,16 @@ import pytest
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.outputs.drive_files import Recorder, ResultsError
+from birdslam.outputs.drive_video import SideBySide
 from birdslam.outputs.earth_files import GeoLine, write_geo_lines
 from birdslam.outputs.placed import Place, write_places
 from birdslam.outputs.report.drawings import speeds
 from birdslam.outputs.report.drive_table import read_drive
 from birdslam.runtime.cli.main import main
+from birdslam.sources.camera_file import camera_text
 from birdslam.types import Estimate, LaneLine, Lanes, LineKind, MapUpdate, Status, VehicleEstimate
 from tests.cases import first
-from tests.chromium import chromium
+from tests.chromium import chromium, look
 from tests.report_pages import LOOKS, faults, moved
 
 pytest.importorskip("plotly", reason="a report is made by plotly (pip install birdslam[report])")
@@ -88,10 +90,10 @@ def place(k: int) -> Place:
     return Place(k * 10**8, int(k >= RESET), T, T, (49.0 + 1e-5 * k, 8.4, np.pi / 2.0, 1.0))
 
 
-def film(path: Path) -> Path:
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (160, 96))
+def film(path: Path, size_px: tuple[int, int] = (160, 96)) -> Path:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, size_px)
     for k in range(FRAMES):
-        writer.write(np.full((96, 160, 3), 4 * k, np.uint8))
+        writer.write(np.full((*size_px[::-1], 3), 4 * k, np.uint8))
     writer.release()
     return path
 
@@ -205,6 +207,49 @@ def test_a_browser_draws_it_and_the_slider_moves(results: Path, tmp_path: Path, 
     picture = cv2.imread(str(tmp_path / "seen.png"))
     assert picture is not None
     assert picture.std() > 5.0
+
+
+CLICKS = """<script>
+const found = document.getElementById("picture");
+found.decode().then(() => {
+  const box = found.getBoundingClientRect();
+  for (const [x, y] of %s) {
+    const at = { clientX: box.left + x * box.width, clientY: box.top + y * box.height, bubbles: true };
+    found.dispatchEvent(new MouseEvent("click", at));
+  }
+  const known = document.getElementById("length");
+  known.value = "3";
+  known.dispatchEvent(new Event("input"));
+  document.documentElement.dataset.measured = document.getElementById("measured").textContent;
+});
+</script>"""
+
+
+@pytest.mark.skipif(chromium() is None, reason="no Chromium (Debian: apt install chromium)")
+def test_two_clicks_measure_a_length_on_the_road(results: Path, tmp_path: Path) -> None:
+    (results / "camera.toml").write_text(camera_text(CAMERA, ()), encoding="utf-8")
+    drawn = SideBySide(CAMERA)
+    width_px, height_px = drawn.size_px
+    path = report(results, "--video", str(film(results / "film.avi", drawn.size_px)))
+    ends_m = np.array([[-1.0, CAMERA.height_m, 6.0], [1.0, CAMERA.height_m, 6.0]])  # across the road, in camera axes
+    ends_px = drawn.scale * CAMERA.to_px(ends_m[:, :2] / ends_m[:, 2:])
+    clicks = CLICKS % json.dumps((ends_px / [width_px, height_px]).tolist())
+    path.write_text(path.read_text(encoding="utf-8").replace("</body>", clicks + "</body>"), encoding="utf-8")
+    seen = look(path.resolve().as_uri(), tmp_path / "seen.png")
+    assert seen.console == []
+    measured = re.fullmatch(
+        r"Measured: ([\d.]+) m \u00b1 (\d+) %\. For 3 m pass --height ([\d.]+) \(\u00b1 \d+ %\)\.",
+        seen.said["measured"],
+    )
+    assert measured is not None
+    assert float(measured[1]) == pytest.approx(2.0, abs=0.05)  # a click is at a whole pixel
+    assert 3 <= int(measured[2]) <= 15
+    assert float(measured[3]) == pytest.approx(3.0 / float(measured[1]) * CAMERA.height_m, abs=0.02)
+
+
+def test_a_video_of_another_camera_has_no_ruler(results: Path) -> None:
+    page = report(results, "--video", str(film(results / "film.avi"))).read_text(encoding="utf-8")
+    assert "Click two points" not in page
 
 
 @pytest.mark.slow  # a browser

@@ -57,8 +57,9 @@ class SideBySide:
 
     def __init__(self, camera: Camera) -> None:
         self._camera = camera
-        self._scale = min(MAX_SCALE, MAX_WIDTH_PX / camera.width_px)
-        self._image_px = (round(camera.width_px * self._scale), round(camera.height_px * self._scale))
+        #: pixels of the drawn camera image per pixel of the camera
+        self.scale = min(MAX_SCALE, MAX_WIDTH_PX / camera.width_px)
+        self._image_px = (round(camera.width_px * self.scale), round(camera.height_px * self.scale))
         self.size_px = self._image_px[0] + PANEL_PX, self._image_px[1] + STRIP_PX  # width, height; both even
         self.size_px = self.size_px[0] // 2 * 2, self.size_px[1] // 2 * 2
         self._paper: Image = np.full((self.size_px[1], self.size_px[0], 3), _bgr(PAPER), np.uint8)
@@ -114,7 +115,7 @@ class SideBySide:
             )
             if corners[:, 0].min() < 1.0:  # partly behind the image plane
                 continue
-            px = (bev.ego_to_pixel(self._camera, ground, corners) + 0.5) * self._scale - 0.5
+            px = (bev.ego_to_pixel(self._camera, ground, corners) + 0.5) * self.scale - 0.5
             solids.append((vehicle, foot, px))
         if estimate.lanes is not None:
             before = view.copy()
@@ -140,13 +141,13 @@ class SideBySide:
         ground = GroundPlane(ground.height_m, ground.pitch_rad + lanes.tilt_rad, ground.roll_rad)
         bend = lanes.vertical_curvature_per_m
         if lanes.ego is not None:
-            area = (lane_px(self._camera, ground, lanes.ego, from_m, bend) + 0.5) * self._scale - 0.5
+            area = (lane_px(self._camera, ground, lanes.ego, from_m, bend) + 0.5) * self.scale - 0.5
             shade = view.copy()
             if len(area) > 2:
                 cv2.fillPoly(shade, [_fixed(area)], _bgr(EGO), cv2.LINE_AA, SHIFT)
             cv2.addWeighted(shade, LANE_ALPHA, view, 1.0 - LANE_ALPHA, 0.0, view)
         for line in lanes.lines:
-            px = (line_px(self._camera, ground, line, from_m, bend) + 0.5) * self._scale - 0.5
+            px = (line_px(self._camera, ground, line, from_m, bend) + 0.5) * self.scale - 0.5
             colour = _bgr(FAINT if line.kind is LineKind.EDGE else LINE)
             cv2.polylines(view, [_fixed(px)], False, colour, 2, cv2.LINE_AA, SHIFT)
 

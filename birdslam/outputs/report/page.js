@@ -70,6 +70,57 @@ function move() {
   }
 }
 
+// Two clicks on the road in a picture: their distance at the camera's height, and the height that a true length implies
+const clicks = [];
+
+function onRoad([x, y], tilt) {
+  const { scale_px, focal_px, centre_px, height_m, normal, normal_sigma } = data.ruler;
+  const ray = [(x * scale_px[0] - centre_px[0]) / focal_px[0], (y * scale_px[1] - centre_px[1]) / focal_px[1], 1];
+  const down = ray.reduce((sum, part, k) => sum - part * (normal[k] + tilt * normal_sigma[k]), 0);
+  return down > 0 ? ray.map((part) => part * height_m / down) : null;
+}
+
+function lengthOf([a, b], tilt) {
+  const [p, q] = [onRoad(a, tilt), onRoad(b, tilt)];
+  return p && q ? Math.hypot(...p.map((part, k) => part - q[k])) : NaN;
+}
+
+function measure() {
+  const out = document.getElementById("measured");
+  for (const dot of document.querySelectorAll(".dot")) dot.remove();
+  for (const [x, y] of clicks) {
+    const dot = document.createElement("i");
+    dot.className = "dot";
+    [dot.style.left, dot.style.top] = [`${picture.offsetLeft + x * picture.clientWidth}px`, `${picture.offsetTop + y * picture.clientHeight}px`];
+    picture.parentElement.append(dot);
+  }
+  if (clicks.length < 2) { out.textContent = ""; return; }
+  const length = lengthOf(clicks, 0);
+  const moved = (k, axis) => clicks.map((at, i) => at.map((part, j) => part + (i === k && j === axis ? data.ruler.click : 0)));
+  const changes = [lengthOf(clicks, 1), ...[[0, 0], [0, 1], [1, 0], [1, 1]].map((at) => lengthOf(moved(...at), 0))];
+  const sigma = Math.hypot(...changes.map((other) => other - length)) / length;
+  if (!(sigma < 1)) { out.textContent = "These points are above or too near the horizon."; return; }
+  const percent = `${Math.max(1, Math.round(100 * sigma))} %`;
+  const known = Number(document.getElementById("length").value);
+  const height = data.ruler.height_m * known / length;
+  out.textContent = `Measured: ${length.toFixed(2)} m \u00b1 ${percent}.`
+    + (known > 0 ? ` For ${known} m pass --height ${height.toFixed(2)} (\u00b1 ${percent}).` : "");
+}
+
+if (picture && data.ruler) {
+  picture.addEventListener("click", (event) => {
+    const at = [event.offsetX / picture.clientWidth, event.offsetY / picture.clientHeight];
+    const { scale_px, size_px } = data.ruler;
+    if (at.some((part, k) => part * scale_px[k] > size_px[k])) return;  // beside the camera image
+    if (clicks.length === 2) clicks.length = 0;
+    clicks.push(at);
+    measure();
+  });
+  document.getElementById("length").addEventListener("input", measure);
+  slider.addEventListener("input", () => { clicks.length = 0; measure(); });
+  window.addEventListener("resize", measure);
+}
+
 slider.max = String(data.t.length - 1);
 slider.addEventListener("input", move);
 dark.addEventListener("change", draw);

@@ -16,9 +16,15 @@ from birdslam.outputs.drive_files import ResultsError
 from birdslam.outputs.report import drawings, wording
 from birdslam.outputs.report.drawings import rounded
 from birdslam.outputs.report.drive_table import DriveTable
+from birdslam.outputs.report.ruler import ruler
 
 REPORT = "report.html"
 STYLE, SCRIPT = (Path(__file__).parent / name for name in ("page.css", "page.js"))
+_RULER = (
+    '<p id="ruler">Click two points of the road to measure their distance. True length: '
+    '<input id="length" type="number" min="0" step="0.01" aria-label="true length in metres"> m '
+    '<output id="measured"></output></p>'
+)
 MAX_PICTURES, PICTURE_WIDTH_PX, JPEG_QUALITY = 150, 900, 68  # of the video, about 6 MB
 
 
@@ -38,9 +44,10 @@ def report_page(drive: DriveTable, video: Path | None = None, plotly: str = "") 
     ResultsError if plotly is not installed.
     """
     script = f'<script src="{html.escape(plotly)}"></script>' if plotly else f"<script>{plotly_script()}</script>"
-    pictures = _pictures(video) if video is not None and video.is_file() else []
+    pictures, video_px = _pictures(video) if video is not None and video.is_file() else ([], (0, 0))
+    road = ruler(drive.camera, video_px, PICTURE_WIDTH_PX) if pictures else None
     name = html.escape(drive.name)
-    film = '<figure id="film"><img id="picture" alt="video frame at this time"></figure>' if pictures else ""
+    film = f'<figure id="film"><img id="picture" alt="video frame at this time">{_RULER if road else ""}</figure>'
     return "\n".join(
         (
             "<!doctype html>",
@@ -49,13 +56,13 @@ def report_page(drive: DriveTable, video: Path | None = None, plotly: str = "") 
             f"<style>{STYLE.read_text(encoding='utf-8')}</style></head><body>",
             f"<header><h1>{name}</h1><p>{wording.facts(drive)}</p></header>",
             f'<section class="verdict"><h2>Validity and accuracy</h2><ul>{wording.verdict(drive)}</ul></section>',
-            f'<main><section id="map" class="plot"></section>{film}</main>',
+            f'<main><section id="map" class="plot"></section>{film if pictures else ""}</main>',
             '<section class="slider"><input id="at" type="range" min="0" step="1" value="0" aria-label="time">'
             '<output id="words"></output></section>',
             '<section id="speed" class="plot low"></section><section id="statuses" class="plot low"></section>',
             *_sections(drive),
             script,
-            f'<script type="application/json" id="data">{_json(_data(drive, pictures))}</script>',
+            f'<script type="application/json" id="data">{_json({**_data(drive, pictures), "ruler": road})}</script>',
             f"<script>{SCRIPT.read_text(encoding='utf-8')}</script></body></html>",
         )
     )
@@ -102,9 +109,13 @@ def _data(drive: DriveTable, pictures: list[tuple[float, str]]) -> dict[str, obj
     return data
 
 
-def _pictures(video: Path) -> list[tuple[float, str]]:
-    """Returns (time in s, JPEG as base64) of pictures at equal intervals. Not every browser plays the codec."""
+def _pictures(video: Path) -> tuple[list[tuple[float, str]], tuple[int, int]]:
+    """Returns (time in s, JPEG as base64) of pictures at equal intervals, and the size of the video.
+
+    Not every browser plays the codec.
+    """
     capture = cv2.VideoCapture(str(video))
+    size_px = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
     count, hz = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), capture.get(cv2.CAP_PROP_FPS)
     every, out, number = max(1, -(-count // MAX_PICTURES)), [], 0
     while capture.grab():
@@ -117,7 +128,7 @@ def _pictures(video: Path) -> list[tuple[float, str]]:
                 out.append((number / max(hz, 1.0), base64.b64encode(jpeg.tobytes()).decode("ascii")))
         number += 1
     capture.release()
-    return out
+    return out, size_px
 
 
 def _json(data: object) -> str:
