@@ -45,7 +45,10 @@ class OwnLens(NamedTuple):
 class Recording(ABC):
     """A recorded drive of one camera: name, camera, and nominal frame rate after the stride.
 
-    `undistorted_frames` are the input of `BirdSLAM`; `frames` are as recorded.
+    `undistorted_frames` are the input of `BirdSLAM`; `frames` are as recorded. Each kind of recording keeps a contract
+    (tests/test_source_contract.py): frames are numbered from 0, their times increase on one clock, images have square
+    pixels and the size of `camera`, an unreadable frame has a reason, and a restart or a stride keeps numbers, times
+    and images.
     """
 
     name: str

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from itertools import pairwise
@@ -102,16 +102,16 @@ class VideoRecording(Recording):
 
     def frames(self, start: int = 0) -> Iterator[RecordedFrame]:
         """Yields the frames in order with the container's times; a truncated file ends with an unreadable frame."""
+        return (frame for frame in self._frames(start) if frame.index >= start)
+
+    def _frames(self, start: int) -> Iterator[RecordedFrame]:
         index, t_ns = 0, -self._films[0].period_ns
         tail: deque[Floats] = deque(maxlen=1)  # the last frames of a film, downsampled
         for film in self._films:
             begin_ns = t_ns + film.period_ns + film.gap_ns
             skipped = _overlap(film.path, list(tail)) if tail and not film.gap_ns else 0
             tail = deque(maxlen=max(1, round(MAX_OVERLAP_S * film.rate_hz)))
-            for frame in self._frames_of(film, index, begin_ns, t_ns, start, skipped, tail):
-                index, t_ns = frame.index + 1, frame.t_source_ns
-                if frame.index >= start:
-                    yield frame
+            index, t_ns = yield from self._frames_of(film, index, begin_ns, t_ns, start, skipped, tail)
 
     def _frames_of(
         self,
@@ -122,10 +122,11 @@ class VideoRecording(Recording):
         start: int,
         skipped: int,
         tail: deque[Floats],
-    ) -> Iterator[RecordedFrame]:
+    ) -> Generator[RecordedFrame, None, tuple[int, int]]:
         """Yields the frames of a file after its first `skipped`, numbered from `index`; adds small ones to `tail`.
 
-        Frames before `start` are not decoded, except the last ones, which `tail` needs.
+        Frames before `start` are not decoded, except the last ones, which `tail` needs. Returns the next index and the
+        time of the last frame, for any stride.
         """
         followed = film is not self._films[-1]
         capture = _capture(film.path)
@@ -161,10 +162,13 @@ class VideoRecording(Recording):
                 position += 1
             if film.ends_early(position, (t_ns - begin_ns) / NS_PER_S):
                 error = f"{film.path}: ends after {position} of {film.declared} frames: cut off"
-                yield RecordedFrame(index, t_ns + film.period_ns, None, error)
             elif is_torn(film.path):
                 error = f"{film.path}: ends within a packet, after {position} frames: cut off"
-                yield RecordedFrame(index, t_ns + film.period_ns, None, error)
+            else:
+                return index, t_ns
+            t_ns += film.period_ns
+            yield RecordedFrame(index, t_ns, None, error)
+            return index + 1, t_ns
         finally:
             capture.release()
 
