@@ -15,7 +15,7 @@ from birdslam.odometry.corners.two_view import initial_two_view, two_view_from_p
 from birdslam.odometry.odometry import Odometry
 from birdslam.odometry.road.alignment import RoadAlignConfig, RoadAligner
 from birdslam.odometry.road.road_image import RoadImage
-from birdslam.odometry.road.scale_search import best_correlation, far_changed_pixels
+from birdslam.odometry.road.scale_search import best_length, explained_by_motion
 from birdslam.perf.accuracy.drives import Task, errors, follow, read
 from birdslam.sources.opening import open_recording
 from birdslam.types import Status
@@ -128,46 +128,41 @@ def test_features_with_reversed_parallax_do_not_affect_the_first_pose() -> None:
         assert fits[backwards].sum() == 0
 
 
-@pytest.mark.parametrize(
-    ("changed", "found_m"),
-    [
-        ([[0.2, 0.1, 0.1], [0.2, 0.1, 0.7]], 2.0),  # behind a bonnet, or in a video whose encoder leaves asphalt still
-        ([[0.9, 0.5, 0.1], [0.9, 0.4, 0.1]], 0.05),  # a stationary car
-        ([[0.2, 0.1, 0.1], [0.2, 0.1, 0.25]], 0.05),  # what may be chance
-    ],
-)
-def test_static_pixels_are_not_road_if_changed_pixels_move(changed: list[list[float]], found_m: float) -> None:
-    lengths = np.array([0.05, 1.0, 2.0])
-    whole = [[0.6, 0.2, 0.3], [0.8, 0.2, 0.3]]
-    pitch, length = best_correlation(lambda half: np.array(changed if half else whole), lengths)
-    assert lengths[length] == found_m
-    assert pitch == 1
+def _explained(past: np.ndarray, present: np.ndarray, lengths_m: np.ndarray) -> np.ndarray:
+    """(1, L) share of the road's image that a straight motion by each of the lengths explains."""
+    aligner = RoadAligner(CAMERA, RoadAlignConfig())
+    px = aligner.samples((0.0, 0.0), NO_BOXES, None)
+    images = [aligner.image(image) for image in (past, present)]
+    translations = np.outer(lengths_m, [0.0, 0.0, 1.0])
+    return explained_by_motion(CAMERA, images[0], images[1], np.eye(3), translations, px, (0.0, 0.0))[None]
 
 
-def test_changed_pixels_are_not_needed_if_the_road_moves() -> None:
-    asked: list[bool] = []
-
-    def alike(half: bool) -> np.ndarray:
-        asked.append(half)
-        return np.array([[0.2, 0.8]])
-
-    assert best_correlation(alike, np.array([0.05, 2.0])) == (0, 1)
-    assert asked == [False]
-
-
-def test_changed_pixels_are_taken_from_the_farther_road() -> None:
-    past = RoadImage.from_normalised(np.zeros((8, 8), np.float32), 4)
-    present = RoadImage.from_normalised(np.zeros((8, 8), np.float32), 4)
-    present.grey[1:3] = [[5.0], [-6.0]]  # rows 5 and 6 of the image
-    present.grey[6:] = 20.0  # a shadow on the near road
-    px = np.array([[u, v] for v in range(4, 12) for u in range(8)])
-    shown = far_changed_pixels(past, present, px)
-    assert sorted({tuple(one) for one in shown.tolist()}) == sorted((u, v) for v in (5, 6) for u in range(8))
+@pytest.mark.parametrize("length_m", [0.6, 1.0, 2.2])
+@pytest.mark.parametrize("static_grey", [0.0, 40.0, 80.0])
+def test_a_pattern_fixed_in_the_image_does_not_hide_the_motion(length_m: float, static_grey: float) -> None:
+    """A bonnet, reflections, or an encoder that leaves smooth asphalt still correlate best at no motion."""
+    plain, rng = Plain(), np.random.default_rng(8)
+    pattern = cv2.GaussianBlur(rng.normal(size=(CAMERA.height_px, CAMERA.width_px)), (0, 0), 1.5)
+    static = static_grey * pattern / pattern.std() / 3.0
+    past, present = (
+        np.clip(0.5 * plain.render(Pose(np.eye(3), np.array([0.0, 0.0, z_m]))) + 64.0 + static, 0, 255).astype(np.uint8)
+        for z_m in (0.0, length_m)
+    )
+    lengths_m = np.geomspace(0.03, 6.0, 84)
+    assert lengths_m[best_length(_explained(past, present, lengths_m))[1]] == pytest.approx(length_m, rel=0.07)
 
 
-def test_road_of_one_row_has_no_farther_part() -> None:
-    image = RoadImage.from_normalised(np.zeros((1, 8), np.float32), 4)
-    assert len(far_changed_pixels(image, image, np.array([[u, 4] for u in range(8)]))) == 0
+@pytest.mark.parametrize("noise_grey", [0.0, 1.0, 3.0])
+def test_a_stationary_camera_has_no_length(noise_grey: float) -> None:
+    rng = np.random.default_rng(9)
+    grey = Plain().render(Pose(np.eye(3), np.zeros(3))).astype(float)
+    past, present = (np.clip(grey + rng.normal(0.0, noise_grey, grey.shape), 0, 255).astype(np.uint8) for _ in range(2))
+    assert best_length(_explained(past, present, np.geomspace(0.03, 6.0, 84)))[1] == 0
+
+
+def test_motion_that_leaves_the_image_explains_nothing() -> None:
+    grey = Plain().render(Pose(np.eye(3), np.zeros(3)))
+    assert _explained(grey, grey, np.array([60.0])).max() == 0.0
 
 
 # --- on recorded drives ---

@@ -1,7 +1,7 @@
 """Initial motion between two images without a motion model, at the start and after a loss of tracking.
 
 Rotation: blocks above the horizon of the cylindrical projection vote for yaw and pitch by normalised cross-correlation.
-Length: correlation of the road's image over distance and pitch (road/scale_search.py); the direction follows from the
+Length: regression of the road's image over distance and pitch (road/scale_search.py); the direction follows from the
 rotation about the rear axle.
 """
 
@@ -18,7 +18,7 @@ from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import Pose, rotation_exp
 from birdslam.odometry.road.alignment import RoadAligner
 from birdslam.odometry.road.road_image import RoadImage
-from birdslam.odometry.road.scale_search import best_correlation, correlations, far_changed_pixels
+from birdslam.odometry.road.scale_search import best_length, explained_by_motion
 
 Floats = NDArray[np.float64]
 Grey = NDArray[np.float32]
@@ -106,27 +106,20 @@ class MotionInitialiser:
     # --- length ---
 
     def road_motion(self, R_past_present: Floats, past: RoadImage, present: RoadImage) -> Pose:
-        """T_past_present of this rotation with the length of best correlation on the road."""
+        """T_past_present of this rotation with the length that explains most of the road."""
         yaw_rad = float(np.arctan2(R_past_present[0, 2], R_past_present[2, 2]))
-        views = []
-        for pitch_rad in self._pitches_rad:
-            px = self._aligner.samples((float(pitch_rad), self.camera.roll_rad), _NO_BOXES, None)
+        motions, explained = [], []
+        for pitch_rad in map(float, self._pitches_rad):
+            tilt = pitch_rad, self.camera.roll_rad
+            px = self._aligner.samples(tilt, _NO_BOXES, None)
             px = px[:: max(1, len(px) // self.config.samples)]
             if len(px) >= 50:
-                views.append((float(pitch_rad), self._translations(yaw_rad, float(pitch_rad)), px))
-
-        def correlate(changed: bool) -> Floats:
-            rows = []
-            for pitch_rad, translations, px in views:
-                tilt = (pitch_rad, self.camera.roll_rad)
-                shown = far_changed_pixels(past, present, px) if changed else px
-                rows.append(correlations(self.camera, past, present, R_past_present, translations, shown, tilt))
-            return np.array(rows)
-
-        if not views:
+                motions.append(self._translations(yaw_rad, pitch_rad))
+                explained.append(explained_by_motion(self.camera, past, present, R_past_present, motions[-1], px, tilt))
+        if not motions:
             return Pose(R_past_present, np.zeros(3))
-        pitch, length = best_correlation(correlate, self._lengths_m)
-        return Pose(R_past_present, views[pitch][1][length])
+        pitch, length = best_length(np.array(explained))
+        return Pose(R_past_present, motions[pitch][length])
 
     def _translations(self, yaw_rad: float, pitch_rad: float) -> Floats:
         """(L, 3) translations of the camera for arcs of constant curvature of the rear axle."""

@@ -1,4 +1,4 @@
-"""Search for an unknown length, by landmarks on the road and by correlation of the road's image.
+"""Search for an unknown length, by landmarks on the road and by regression of the road's image.
 
 An alignment (alignment.py) converges only within the size of the road's texture; the search initializes it. Landmarks
 give a length that is up to a tenth too short, but reflections and periodic stripes do not affect it. So they bound the
@@ -7,7 +7,6 @@ accepted alignments.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -25,8 +24,11 @@ from birdslam.odometry.road.road_image import RoadImage
 Floats = NDArray[np.float64]
 
 _LENGTHS_M = np.geomspace(0.03, 6.0, 84)  # candidates of an unknown length
-_STATIONARY_M = 0.1  # a shorter motion is a standstill
-_MIN_LEAD = 0.1  # of the changed pixels' correlation over that at standstill
+_SAMPLES = 900  # compared pixels
+_MIN_FLOW_PX = 1.5  # of a pixel that moves with the road: a smaller one is like no motion
+_MIN_VISIBLE_RATIO = 0.5  # of the pixels, those that move within the image
+_MIN_EXPLAINED = 0.03  # minimum squared partial correlation of a motion
+_MIN_UNEXPLAINED = 1e-3  # minimum ratio of variance that an image leaves unexplained: noise
 # Landmarks on the road: area of a lane and its neighbours, maximum sigma of the depth, width of the mode
 _ROAD_NEAR_M, _ROAD_FAR_M, _ROAD_HALF_WIDTH_M = 3.0, 30.0, 6.0
 _DEPTH_SIGMA_REL = 0.25
@@ -116,50 +118,31 @@ def search_length(
     tilt: tuple[float, float],
     lengths: Floats,
 ) -> float:
-    """Returns that of `lengths` (L,) in metres with the best correlation on a flat road, over three pitches.
+    """Returns that of `lengths` (L,) in metres that explains most of the image of a flat road, over three pitches.
 
     `px` (N, 2) are pixels of the current image that show road, `tilt` is (pitch, roll) in rad. Only the direction of
     the translation of `T_past_present` is used.
     """
-    px = px[:: max(1, len(px) // 900)]
-    tilts = [(pitch_rad, tilt[1]) for pitch_rad in (tilt[0] - 0.01, tilt[0], tilt[0] + 0.01)]
+    px = px[:: max(1, len(px) // _SAMPLES)]
+    R = T_past_present.R
     translations = lengths[:, None] * (T_past_present.p / max(float(np.linalg.norm(T_past_present.p)), 1e-9))
-
-    def correlate(changed: bool) -> Floats:
-        shown = far_changed_pixels(past, present, px) if changed else px
-        return np.array(
-            [correlations(camera, past, present, T_past_present.R, translations, shown, each) for each in tilts]
-        )
-
-    return float(lengths[best_correlation(correlate, lengths)[1]])
+    tilts = [(pitch_rad, tilt[1]) for pitch_rad in (tilt[0] - 0.01, tilt[0], tilt[0] + 0.01)]
+    gains = np.array([explained_by_motion(camera, past, present, R, translations, px, each) for each in tilts])
+    return float(lengths[best_length(gains)[1]])
 
 
-def best_correlation(correlate: Callable[[bool], Floats], lengths: Floats) -> tuple[int, int]:
-    """Indices of the pitch and of the length, of `lengths` (L,) ascending in metres, with the best correlation.
+def best_length(explained: Floats) -> tuple[int, int]:
+    """Indices of the pitch and of the length with the largest of `explained` (pitches, L); the first if all are small.
 
-    `correlate(changed)` returns correlations (pitches, L) over the whole road, or over its changed far pixels. No
-    length explains the changed pixels of a stationary car. If one does, the bonnet or encoder artifacts correlate at
-    standstill.
+    The lengths ascend; the first is that of a stationary camera.
     """
-    by_road = correlate(False)
-    pitch, length = np.unravel_index(int(by_road.argmax()), by_road.shape)
-    if lengths[length] < _STATIONARY_M:
-        by_change = correlate(True)
-        changed_pitch, changed_length = np.unravel_index(int(by_change.argmax()), by_change.shape)
-        if by_change[changed_pitch, changed_length] > by_change[:, lengths < _STATIONARY_M].max() + _MIN_LEAD:
-            pitch, length = changed_pitch, changed_length
+    pitch, length = np.unravel_index(int(explained.argmax()), explained.shape)
+    if explained[pitch, length] < _MIN_EXPLAINED:
+        return int(pitch), 0
     return int(pitch), int(length)
 
 
-def far_changed_pixels(past: RoadImage, present: RoadImage, px: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The most changed half of the farther half of the road's pixels (N, 2) in the current image."""
-    far = px[px[:, 1] < np.median(px[:, 1])]
-    then, now = (image.grey[far[:, 1] - image.top_px, far[:, 0]] for image in (past, present))
-    change = np.abs(now - then)
-    return far[change >= np.median(change)] if len(far) else far
-
-
-def correlations(
+def explained_by_motion(
     camera: Camera,
     past: RoadImage,
     present: RoadImage,
@@ -168,25 +151,48 @@ def correlations(
     px: NDArray[np.int64],
     tilt: tuple[float, float],
 ) -> Floats:
-    """(L,) correlation of the road's pixels (N, 2) with the past image, for each of the translations (L, 3)."""
+    """(L,) squared partial correlation of the road in two images for each of the translations (L, 3), 0 to 1.
+
+    The present image is a regression on the past image, warped by the motion over a flat road, and on the past image as
+    it is. The second regressor explains what does not move with the road: the bonnet, reflections, drops, and encoder
+    artifacts on smooth asphalt. The result is the ratio of what it leaves unexplained that the motion explains.
+    `px` (N, 2) are pixels of the current image that show road, `tilt` is (pitch, roll) in rad.
+    """
     f32 = np.float32
     focal_px, centre_px = [camera.fx_px, camera.fy_px], [camera.cx_px, camera.cy_px]
     rays = np.stack([*((px - centre_px) / focal_px).T, np.ones(len(px))]).astype(f32)
-    here = present.grey[px[:, 1] - present.top_px, px[:, 0]]
     rho = (plane_normal(*tilt)[0].astype(f32) @ rays) * f32(-1.0 / camera.height_m)
     q = (R_past_present.astype(f32) @ rays)[:, None, :] + translations.astype(f32).T[:, :, None] * rho
     by_z = f32(1.0) / np.maximum(q[2], f32(1e-3))
     u = q[0] * by_z * f32(camera.fx_px) + f32(camera.cx_px)
     v = q[1] * by_z * f32(camera.fy_px) + f32(camera.cy_px - past.top_px)
     rows, cols = past.grey.shape
-    inside = ((u > 0) & (u < cols - 1) & (v > 0) & (v < rows - 1)).astype(f32)
-    count = np.maximum(inside.sum(axis=1), 1.0)
-    a, b = cv2.remap(past.grey, u, v, cv2.INTER_LINEAR) * inside, here * inside
-    mean_a, mean_b = a.sum(axis=1) / count, b.sum(axis=1) / count
-    ab, aa, bb = (np.einsum("ij,ij->i", *pair) for pair in ((a, b), (a, a), (b, b)))
-    variances = (aa - count * mean_a**2) * (bb - count * mean_b**2)
-    out: Floats = (ab - count * mean_a * mean_b) / np.sqrt(np.maximum(variances, 1e-9))
-    out[count < 0.5 * len(px)] = -1.0  # most pixels leave the image
+    static_u, static_v = px[:, 0].astype(f32), (px[:, 1] - past.top_px).astype(f32)
+    moves = np.abs(u - static_u) + np.abs(v - static_v) > _MIN_FLOW_PX
+    inside = ((u > 0) & (u < cols - 1) & (v > 0) & (v < rows - 1) & moves).astype(f32)
+    warped = cv2.remap(past.grey, u, v, cv2.INTER_LINEAR) * inside
+    here, static = (image.grey[px[:, 1] - image.top_px, px[:, 0]] for image in (present, past))
+
+    count, here_sum, static_sum, here_sq, static_sq, here_static = (
+        inside @ np.stack([np.ones_like(here), here, static, here * here, static * static, here * static], axis=1)
+    ).T.astype(np.float64)
+    n = np.maximum(count, 1.0)
+    warped_sum, warped_sq = warped.sum(axis=1), np.einsum("ij,ij->i", warped, warped)
+    warped_here, warped_static = (warped @ np.stack([here, static], axis=1)).T
+
+    def correlation(ab: Floats, a: Floats, b: Floats, aa: Floats, bb: Floats) -> Floats:
+        variances = np.maximum(aa - a * a / n, 1e-6) * np.maximum(bb - b * b / n, 1e-6)
+        out: Floats = np.clip((ab - a * b / n) / np.sqrt(variances), -1.0, 1.0)
+        return out
+
+    by_road = correlation(warped_here, warped_sum, here_sum, warped_sq, here_sq)
+    by_static = correlation(here_static, here_sum, static_sum, here_sq, static_sq).clip(0.0)
+    between = correlation(warped_static, warped_sum, static_sum, warped_sq, static_sq)
+    partial = (by_road - between * by_static) / np.sqrt(
+        np.maximum((1.0 - between**2) * (1.0 - by_static**2), _MIN_UNEXPLAINED)
+    )
+    partial = np.where(count < _MIN_VISIBLE_RATIO * len(px), 0.0, partial.clip(0.0, 1.0))
+    out: Floats = partial**2
     return out
 
 
