@@ -6,6 +6,7 @@ import shutil
 import struct
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
+from fractions import Fraction
 from pathlib import Path
 
 import cv2
@@ -230,6 +231,30 @@ def test_any_subtitle_text_gives_fixes_or_an_error(text: str) -> None:
     except GnssError:
         fixes = []
     assert all(abs(fix.latitude_deg) <= 90.0 for fix in fixes)
+
+
+@exiftool
+@pytest.mark.parametrize("form", SUBTITLES)
+def test_a_subtitle_track_of_a_film_is_read(form: str, tmp_path: Path) -> None:
+    av = pytest.importorskip("av", reason="films with subtitles are written by PyAV (pip install av)")
+    path = tmp_path / "film.mp4"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=1)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        subtitles = container.add_mux_stream("mov_text")
+        subtitles.time_base = Fraction(1, 1000)
+        for k, fix in enumerate(FIXES):
+            picture = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 9 * k, np.uint8), "bgr24")
+            container.mux(stream.encode(picture))
+            text = SUBTITLES[form].format(lat=fix.latitude_deg, lon=fix.longitude_deg, west=-fix.longitude_deg).encode()
+            packet = av.packet.Packet(struct.pack(">H", len(text)) + text)
+            packet.stream, packet.pts, packet.dts, packet.duration = subtitles, 1000 * k, 1000 * k, 1000
+            container.mux(packet)
+        container.mux(stream.encode())
+    found = read_film(path)
+    assert [fix.t_film_s for fix in found] == pytest.approx(range(len(FIXES)), abs=0.01)
+    degrees = [(fix.latitude_deg, fix.longitude_deg) for fix in found]
+    assert degrees == pytest.approx(np.array([(fix.latitude_deg, fix.longitude_deg) for fix in FIXES]), abs=1e-6)
 
 
 @exiftool

@@ -1,4 +1,4 @@
-"""GNSS tracks of films: in subtitles beside the film (FILM.srt), or inside it as GoPro, Novatek and others write them.
+"""GNSS tracks of films: in subtitles beside the film (FILM.srt) or in it, or as GoPro, Novatek and others write them.
 
 ExifTool, a program of its own (Debian: libimage-exiftool-perl), reads those inside. Fixes become a GPX track beside the
 results, which `--gnss` and `--speed` read like any other.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -20,13 +20,14 @@ import numpy as np
 
 from birdslam.loops.gnss.earth import is_on_earth
 from birdslam.loops.gnss.files import GnssError, read_fixes
+from birdslam.loops.gnss.subtitles import cue_fixes
 from birdslam.outputs.earth_files import GeoLine, write_geo_lines
 from birdslam.types import NS_PER_S
 
 TRACK_FILE = "film.gpx"
 INSTALL = "ExifTool reads it: apt install libimage-exiftool-perl"
 _PROGRAM = "exiftool"
-_TAGS = ("-GPSLatitude", "-GPSLongitude", "-GPSDateTime", "-SampleTime")
+_TAGS = ("-GPSLatitude", "-GPSLongitude", "-GPSDateTime", "-SampleTime", "-Text")
 _LIMIT_S = 120.0
 _DATE_TIME = re.compile(r"(\d{4}):(\d\d):(\d\d) (\d\d):(\d\d):(\d\d)(\.\d+)?(Z|[+-]\d\d:\d\d)?")
 
@@ -69,7 +70,17 @@ def read_film(path: Path) -> list[FilmFix]:
         if group.startswith("Doc") and value not in (None, ""):
             samples.setdefault(group, {})[tag] = value
     found = (_fix(sample) for sample in samples.values())
-    return [fix for fix in found if fix is not None]
+    return [fix for fix in found if fix is not None] or _of_subtitle_track(samples.values())
+
+
+def _of_subtitle_track(samples: Iterable[dict[str, Any]]) -> list[FilmFix]:
+    """The fixes in the texts of a subtitle track."""
+    cues = (
+        (float(sample["SampleTime"]), str(sample["Text"]))
+        for sample in samples
+        if sample.keys() >= {"SampleTime", "Text"}
+    )
+    return [FilmFix(latitude, longitude, None, t_s) for _, (t_s, latitude, longitude, *_) in cue_fixes(cues)]
 
 
 def track_of_films(films: Sequence[Path], path: Path) -> int:

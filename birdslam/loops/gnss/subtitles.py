@@ -7,7 +7,7 @@ the longitude first (DJI), `N22.5 E113.9` or `22.5N, 113.9E`.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 from birdslam.loops.gnss.earth import DEFAULT_SIGMA_M
 from birdslam.loops.gnss.sentences import Sentence
@@ -29,17 +29,26 @@ def is_subtitles(text: str) -> bool:
 
 def subtitle_fixes(text: str) -> Iterator[tuple[int, Sentence]]:
     """Yields the number of each cue with a new fix, and the fix, with the time in the film in s."""
+    cues = list(CUE.finditer(text))
+    ends = [*(cue.start() for cue in cues[1:]), len(text)]
+    return cue_fixes((_begin_s(cue), text[cue.end() : end]) for cue, end in zip(cues, ends, strict=True))
+
+
+def cue_fixes(cues: Iterable[tuple[float, str]]) -> Iterator[tuple[int, Sentence]]:
+    """As `subtitle_fixes`, of the time in s and the text of each cue."""
     last: tuple[float, float] | None = None
     last_s = 0.0
-    cues = list(CUE.finditer(text))
-    for number, (cue, end) in enumerate(zip(cues, [*(c.start() for c in cues[1:]), len(text)], strict=True), start=1):
-        found = _position(text[cue.end() : end])
-        hours, minutes, seconds = (int(word) for word in cue.groups()[:3])
-        t_s = 3600.0 * hours + 60.0 * minutes + seconds + float(f"0.{cue[4]}")
+    for number, (t_s, text) in enumerate(cues, start=1):
+        found = _position(text)
         if found is None or (found == last and t_s - last_s < _REPEATED_S):
             continue
         last, last_s = found, t_s
         yield number, (t_s, *found, DEFAULT_SIGMA_M, None)
+
+
+def _begin_s(cue: re.Match[str]) -> float:
+    hours, minutes, seconds = (int(word) for word in cue.groups()[:3])
+    return 3600.0 * hours + 60.0 * minutes + seconds + float(f"0.{cue[4]}")
 
 
 def _position(text: str) -> tuple[float, float] | None:
