@@ -161,6 +161,7 @@ def test_a_drive_becomes_a_model_in_metres(drive: Path, tmp_path: Path, capsys: 
     assert np.median(heights_m) > -0.5  # on or above the road, as far as tracks and poses go
 
 
+@pytest.mark.processes
 @pytest.mark.skipif(find_spec("pycolmap") is None, reason="pycolmap is not installed")
 def test_colmap_reads_the_model(tmp_path: Path) -> None:
     views(ahead(30), along(5, 0.01)).write_colmap(tmp_path)
