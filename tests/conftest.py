@@ -36,7 +36,7 @@ if seed := os.environ.get("BIRDSLAM_ROUNDING"):
 # ones by the profile "explore", and prints how to repeat one that fails.
 settings.register_profile(
     "repeat",
-    max_examples=50,
+    max_examples=30,
     deadline=None,
     derandomize=True,
     database=None,

@@ -175,7 +175,7 @@ def test_an_invalid_estimate_leaves_no_pose() -> None:
     assert [pose.frame_id for pose in way.ego] == [0]
 
 
-@settings(max_examples=50)
+@settings(max_examples=20)
 @given(st.lists(st.tuples(st.floats(-1e308, 1e308), st.floats(-50.0, 50.0)), max_size=200))
 def test_every_point_of_a_road_has_its_cell(points: list[tuple[float, float]]) -> None:
     config = AtlasConfig(map_cells=1000)

@@ -72,7 +72,7 @@ def test_no_road_above_the_horizon() -> None:
     assert np.isnan(bev.pixel_to_ego(camera(), GroundPlane(1.65), np.array([[600.0, 172.0], [600.0, 173.0]]))).all()
 
 
-@settings(max_examples=20)
+@settings(max_examples=6)
 @given(st.floats(5.0, 25.0), st.floats(-6.0, 6.0), st.floats(-0.02, 0.02))
 def test_covariance_is_that_of_sampled_errors(x_m: float, y_m: float, pitch_rad: float) -> None:
     lens, ground, sigma_px, sigma_pitch, sigma_height = camera(), GroundPlane(1.65, pitch_rad), 0.3, 0.0005, 0.01

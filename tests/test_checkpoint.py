@@ -46,7 +46,7 @@ def worn(log: list[Measurements], break_at: int, blind_at: int) -> list[Measurem
     return log
 
 
-@settings(max_examples=15)
+@settings(max_examples=8)
 @given(
     world=st.sampled_from(WORLDS),
     cut=st.integers(0, 200),

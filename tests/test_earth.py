@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pymap3d
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from birdslam.geometry.camera import Camera
@@ -254,6 +254,7 @@ def test_fixes_inside_a_dashcam_film_are_read(data_dir: Path) -> None:
     assert all(7.0 < fix.speed_mps < 13.0 for fix in fixes if fix.speed_mps)
 
 
+@settings(max_examples=12)
 @given(
     st.dictionaries(st.integers(0, 39), st.tuples(st.floats(-1e5, 1e5), st.floats(-1e5, 1e5)), max_size=4),
     st.integers(0, 5),

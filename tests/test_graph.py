@@ -547,7 +547,7 @@ def test_the_same_log_gives_the_same_bytes_in_every_process() -> None:
     assert other.stdout.strip() == hashlib.sha256(mine).hexdigest()
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(
     config=st.builds(
         DriveConfig,

@@ -1,9 +1,12 @@
 """Repeated drives: place recognition, kept maps, loop closure, in simulated streets with exact truth."""
 
+import copy
 import math
 import struct
 import zlib
+from collections.abc import Iterator
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import msgspec
@@ -36,7 +39,7 @@ from birdslam.runtime.maps import held_way, map_drive
 from birdslam.runtime.maps.map_drive import MapChoice
 from birdslam.runtime.maps.map_store import read_map, write_map
 from birdslam.trajectory import mount_pose
-from birdslam.types import Attitude
+from birdslam.types import Attitude, Estimate
 from tests import drifting_scale
 from tests.cases import first
 
@@ -75,11 +78,37 @@ def errors(found: list[tuple[Localisation, SE2]]) -> np.ndarray:
     )
 
 
+FIRST = 20  # frames of the drive that localise it
+
+
+def second_drive() -> Iterator[tuple[Estimate, Features, SE2]]:
+    return drive(STREET, range(10, 70), 3)
+
+
+@pytest.fixture(scope="module")
+def after_first(mapped: bytes) -> MapSession:
+    running = session(decode_map(mapped), extend=False)
+    for estimate, seen, _ in islice(second_drive(), FIRST):
+        here = running.step(estimate, seen)  # type: ignore[arg-type]
+    assert here.state is MapState.LOCALISED
+    return running
+
+
+@pytest.fixture
+def localised(after_first: MapSession) -> MapSession:
+    return another(after_first)
+
+
+def another(after_first: MapSession) -> MapSession:
+    """A session in the same map after the FIRST frames of the second drive."""
+    return copy.deepcopy(after_first, {id(after_first.map): after_first.map})
+
+
 @pytest.mark.parametrize(
-    "how", first(2, [{}, {"lateral_m": 1.5}, {"bits": OTHER_LIGHT_BITS}]), ids=["same", "lane", "light"]
+    "how", first(1, [{"lateral_m": 1.5}, {}, {"bits": OTHER_LIGHT_BITS}]), ids=["lane", "same", "light"]
 )
 def test_a_second_drive_is_localised(mapped: bytes, how: dict[str, float]) -> None:
-    found = driven(decode_map(mapped), STREET, range(20, 80), seed=7, **how)
+    found = driven(decode_map(mapped), STREET, range(20, 60), seed=7, **how)
     error = errors(found)
     assert len(error) >= 0.9 * len(found)
     position = np.hypot(error[:, 0], error[:, 1])
@@ -128,27 +157,18 @@ def test_lost_ego_has_no_pose_and_no_small_covariance(mapped: bytes) -> None:
         assert np.isinf(here.cov).all()
 
 
-def test_covariance_grows_without_matches_until_lost(mapped: bytes) -> None:
-    running = session(decode_map(mapped), extend=False)
-    states, sigma = [], []
-    for number, (estimate, seen, _) in enumerate(drive(STREET, range(10, 70), 3)):
-        here = running.step(estimate, seen if number < 20 else None)  # type: ignore[arg-type]
-        states.append(here.state)
-        sigma.append(math.sqrt(here.cov[0, 0]) if here.T_map_ego else math.inf)
-    assert states[19] is MapState.LOCALISED
-    assert states[-1] is MapState.ODOMETRY_ONLY
-    assert np.all(np.diff(sigma[20:]) > 0.0)
+def test_covariance_grows_without_matches_until_lost(localised: MapSession) -> None:
+    found = [localised.step(estimate, None) for estimate, _, _ in islice(second_drive(), FIRST, None)]
+    assert found[-1].state is MapState.ODOMETRY_ONLY
+    sigma = [math.sqrt(here.cov[0, 0]) if here.T_map_ego else math.inf for here in found]
+    assert np.all(np.diff(sigma) > 0.0)
 
 
-def test_invalid_odometry_ends_localisation(mapped: bytes) -> None:
-    states = {}
-    for valid in (True, False):
-        running = session(decode_map(mapped), extend=False)
-        for number, (estimate, seen, _) in enumerate(drive(STREET, range(10, 34), 3)):
-            estimate = msgspec.structs.replace(estimate, valid=valid or number < 20)
-            here = running.step(estimate, seen if number < 20 else None)  # type: ignore[arg-type]
-        states[valid] = here.state
-    assert states == {True: MapState.LOCALISED, False: MapState.ODOMETRY_ONLY}
+@pytest.mark.parametrize(("valid", "state"), [(True, MapState.LOCALISED), (False, MapState.ODOMETRY_ONLY)])
+def test_invalid_odometry_ends_localisation(localised: MapSession, valid: bool, state: MapState) -> None:
+    for estimate, _, _ in islice(second_drive(), FIRST, FIRST + 4):
+        here = localised.step(msgspec.structs.replace(estimate, valid=valid), None)
+    assert here.state is state
 
 
 def test_new_map_starts_with_the_first_valid_frame() -> None:
@@ -163,19 +183,21 @@ def test_new_map_starts_with_the_first_valid_frame() -> None:
     assert np.trace(keyframes[False].cov) < 2.0 * np.trace(keyframes[True].cov)
 
 
-def test_failed_queries_end_localisation(mapped: bytes) -> None:
+def carried(localised: MapSession, looks: bool, scale_sigma_rel: float = 0.0) -> int:
+    """The number of frames that stay localised; their images show another street, or are not used."""
+    count = 0
+    elsewhere = drive(OTHER, range(60), 3)
+    for (estimate, _, _), (_, seen, _) in zip(islice(second_drive(), FIRST, None), elsewhere, strict=False):
+        estimate = msgspec.structs.replace(estimate, scale_sigma_rel=scale_sigma_rel)
+        count += localised.step(estimate, seen if looks else None).state is MapState.LOCALISED  # type: ignore[arg-type]
+    return count
+
+
+def test_failed_queries_end_localisation(after_first: MapSession) -> None:
     """In a mapped street, with an odometry that has drifted off: skipped frames do not count."""
-    states: dict[bool, list[MapState]] = {True: [], False: []}
-    for looked in states:
-        running = session(decode_map(mapped), extend=False)
-        elsewhere = [seen for _, seen, _ in drive(OTHER, range(60), 3)]
-        for number, (estimate, seen, _) in enumerate(drive(STREET, range(10, 70), 3)):
-            after = elsewhere[number] if looked else None
-            states[looked].append(running.step(estimate, seen if number < 20 else after).state)  # type: ignore[arg-type]
-    carried = {looked: sum(state is MapState.LOCALISED for state in found[20:]) for looked, found in states.items()}
-    assert states[True][19] is MapState.LOCALISED
-    assert 1 <= carried[True] <= 6
-    assert carried[False] > 2 * carried[True]
+    looked, skipped = (carried(another(after_first), looks) for looks in (True, False))
+    assert 1 <= looked <= 6
+    assert skipped > 2 * looked
 
 
 def test_near_points_correct_a_wrong_guess(mapped: bytes) -> None:
@@ -242,31 +264,19 @@ def test_uncertain_depths_do_not_bias_lateral_offset(mapped: bytes) -> None:
     assert np.sqrt(np.mean((np.array(off) / sigma) ** 2, axis=0)) == pytest.approx(np.ones(3), abs=0.25)
 
 
-def test_implausible_step_ends_localisation(mapped: bytes) -> None:
+def test_implausible_step_ends_localisation(localised: MapSession) -> None:
     """Odometry that calls itself valid goes back by 2 m within a tenth of a second."""
-    running = session(decode_map(mapped), extend=False)
-    states = {}
-    for number, (estimate, seen, _) in enumerate(drive(STREET, range(10, 40), 3)):
-        if number >= 20:
-            estimate = msgspec.structs.replace(estimate, T_world_ego=estimate.T_world_ego @ SE2(-3.0, 0.0, 0.0))
-        here = running.step(estimate, seen if number < 20 or number > 25 else None)  # type: ignore[arg-type]
-        states[number] = here.state
-    assert [states[number] for number in (19, 20, 25)] == [
-        MapState.LOCALISED, MapState.ODOMETRY_ONLY, MapState.ODOMETRY_ONLY,
-    ]  # fmt: skip
-    assert states[29] is MapState.LOCALISED
+    states = []
+    for number, (estimate, seen, _) in enumerate(islice(second_drive(), FIRST, FIRST + 10)):
+        estimate = msgspec.structs.replace(estimate, T_world_ego=estimate.T_world_ego @ SE2(-3.0, 0.0, 0.0))
+        states.append(localised.step(estimate, seen if number > 5 else None).state)  # type: ignore[arg-type]
+    assert [states[0], states[5]] == [MapState.ODOMETRY_ONLY] * 2
+    assert states[9] is MapState.LOCALISED
 
 
-def test_uncertain_scale_shortens_localisation(mapped: bytes) -> None:
-    carried = []
-    for scale_sigma_rel in (0.0, 0.06):
-        running = session(decode_map(mapped), extend=False)
-        states = []
-        for number, (estimate, seen, _) in enumerate(drive(STREET, range(10, 70), 3)):
-            estimate = msgspec.structs.replace(estimate, scale_sigma_rel=scale_sigma_rel)
-            states.append(running.step(estimate, seen if number < 20 else None).state)  # type: ignore[arg-type]
-        carried.append(sum(state is MapState.LOCALISED for state in states[20:]))
-    assert 4 <= carried[1] < carried[0] / 2
+def test_uncertain_scale_shortens_localisation(after_first: MapSession) -> None:
+    certain, uncertain = (carried(another(after_first), False, sigma) for sigma in (0.0, 0.06))
+    assert 4 <= uncertain < certain / 2
 
 
 def test_late_or_invalid_pose_is_not_a_localisation() -> None:
@@ -291,7 +301,7 @@ def test_kidnapped_ego_is_relocalised(mapped: bytes) -> None:
     """Odometry goes on as if nothing had been, 50 m further along the street."""
     running = session(decode_map(mapped), extend=False)
     first = list(drive(STREET, range(0, 20), 3))
-    then = list(drive(STREET, range(70, 120), 4, first_frame=20))
+    then = list(drive(STREET, range(70, 105), 4, first_frame=20))
     T_odom = first[-1][0].T_world_ego
     for estimate, seen, _ in first:
         running.step(estimate, seen)  # type: ignore[arg-type]
@@ -310,7 +320,7 @@ def test_kidnapped_ego_is_relocalised(mapped: bytes) -> None:
 def test_extended_map_covers_the_second_drive(mapped: bytes) -> None:
     place_map = decode_map(mapped)
     before = len(place_map)
-    driven(place_map, STREET, range(80, 140), extend=True, seed=5)
+    driven(place_map, STREET, range(95, 140), extend=True, seed=5)
     added = place_map.keyframes[before:]
     assert place_map.drives == 2
     assert {keyframe.drive for keyframe in added} == {1}
@@ -335,7 +345,7 @@ def test_loop_closure_joins_end_and_start() -> None:
     street = build(block(50.0), seed=4)
     around = len(street.route)
     place_map = PlaceMap(MapCamera.of(CAMERA))
-    found = driven(place_map, street, range(around + 40), extend=True, seed=11)
+    found = driven(place_map, street, range(around + 30), extend=True, seed=11)
     assert found[-1][0].state is MapState.LOCALISED
     assert any(link.loop for link in place_map.links)
     assert np.abs(errors(found[-1:])[0, :2]).max() < 0.5

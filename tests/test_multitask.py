@@ -169,7 +169,7 @@ poses = st.builds(SE2, st.floats(9.0, 35.0), st.floats(-4.0, 4.0), st.floats(-ma
 sizes_m = st.tuples(st.floats(3.0, 12.0), st.floats(1.5, 2.6), st.floats(1.3, 3.5))
 
 
-@settings(max_examples=60)
+@settings(max_examples=20)
 @given(poses, sizes_m, st.sampled_from(["car", "truck", "bus"]), st.floats(0.45, 1.3))
 def test_encoded_body_is_decoded(pose: SE2, size_m: tuple[float, float, float], label: str, focal: float) -> None:
     cam = camera(focal)
@@ -192,7 +192,7 @@ def test_encoded_body_is_decoded(pose: SE2, size_m: tuple[float, float, float], 
     assert bodies.flip[0] < 0.05
 
 
-@settings(max_examples=30)
+@settings(max_examples=10)
 @given(poses)
 def test_mirrored_world_is_decoded_mirrored(pose: SE2) -> None:
     cam = camera()

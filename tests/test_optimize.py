@@ -182,7 +182,7 @@ def test_late_measurements_correct_the_published_estimate(tmp_path: Path) -> Non
 
 
 @given(st.lists(st.integers(0, 9), min_size=40, max_size=40), st.integers(0, 2**32))
-@settings(max_examples=30)
+@settings(max_examples=10)
 def test_published_frame_numbers_never_fall(lateness: list[int], seed: int) -> None:
     """Measurements come in their order, each so many frames late; a frame is coasted over when it has waited two."""
     node = OptimizeNode(Configuration(source=SourceConfig(rate="max")), Bus())  # type: ignore[arg-type]
