@@ -13,7 +13,6 @@ from birdslam.geometry.camera import Camera
 
 pytest.importorskip("numba", reason="the built-in world is rendered with numba (extra `train`)")
 
-from birdslam.world import town
 from birdslam.world.truth import CLASSES, WorldFrame
 from birdslam.world.world import World, WorldConfig, sample
 
@@ -209,36 +208,3 @@ def test_drive_is_repeatable() -> None:
     world = World(5, WorldConfig(width_px=160, height_px=48, samples=1))
     first, second = ([frame.image.tobytes() for frame in world.frames(3)] for _ in range(2))
     assert first == second
-
-
-# --- the town that is driven around ---
-
-
-def test_round_is_closed() -> None:
-    street = town.scenario(town.DRIVES["twice"]).street
-    s, d = np.arange(0.0, 300.0, 7.0), np.full(43, -4.0)
-    first, second = street.place(s, d), street.place(s + town.ROUND_M, d)
-    assert np.column_stack(first[:3]) == pytest.approx(np.column_stack(second[:3]), abs=1e-6)
-    assert np.cos(first[3] - second[3]) == pytest.approx(1.0)
-    crossings = street.crossings[:, 0]
-    assert set(crossings[crossings < town.ROUND_M] + town.ROUND_M) <= set(crossings)
-
-
-def test_no_scenery_is_on_the_towns_road() -> None:
-    standing = town.scenario(town.DRIVES["twice"]).standing
-    street = town.scenario(town.DRIVES["twice"]).street
-    line = np.column_stack([street.x_m, street.y_m])[: round(town.ROUND_M / town.STEP_M)]
-    apart = np.array([np.hypot(*(line - p).T).min() for p in standing.position_m[:, :2]])
-    assert apart.min() > 2.6  # the one lane back, and a parked car's half width
-
-
-def test_reversed_street_is_the_same_road() -> None:
-    there, back = (town.scenario(town.DRIVES[name]).street for name in ("twice", "back"))
-    s, d = np.arange(10.0, 1000.0, 13.0), np.full(77, 3.0)
-    own, other = there.place(s, d), back.place(back.length_m - s, -d)
-    assert np.column_stack(own[:3]) == pytest.approx(np.column_stack(other[:3]), abs=1e-6)
-    assert np.cos(own[3] - other[3]) == pytest.approx(-1.0)
-    assert there.rise(100.0, there.left_m + 1.0) == pytest.approx(back.rise(back.length_m - 100.0, -there.left_m - 1.0))
-    assert sorted(lane.direction * lane.d_m for lane in back.lanes) == sorted(
-        lane.direction * lane.d_m for lane in there.lanes
-    )

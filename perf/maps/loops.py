@@ -1,16 +1,15 @@
 """Repeated drives: recall and false loops of place recognition, errors of localization, gain of loop closure.
 
-    python -m perf loops [--output FILE.json] [--part recorded|town|loop|alike|gnss|size ...]
+    python -m perf loops [--output FILE.json] [--part recorded|loop|gnss|size ...]
 
-`recorded`: two passes of a KITTI street, each in the map of the other, and other streets in both. `town`: rendered into
---drives, two rounds, then other conditions. `loop`, `alike`: simulated features, and equal houses. `gnss`: fixes that
-jump. `size`: simulated descriptors.
+`recorded`: two passes of a KITTI street, each in the map of the other, and other streets in both. `loop`: simulated
+features. `gnss`: fixes that jump. `size`: simulated descriptors.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,15 +27,18 @@ from birdslam.loops.map_pose import MapState
 from birdslam.loops.place_map import MapCamera, PlaceMap
 from birdslam.loops.session import MapSession
 from birdslam.outputs.map_trajectory import MapTrajectory
-from birdslam.perf.maps import simulated, town
-from birdslam.perf.maps.estimates import Seen, estimated
+from birdslam.perf.maps import simulated
 from birdslam.perf.reporting.arguments import add_data, benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
+from birdslam.runtime.batch.offline import pipeline
+from birdslam.runtime.configuration import load
 from birdslam.runtime.nodes.sources import open_recorded
+from birdslam.types import Estimate
 
 label = "place recognition, localization in a kept map, loop closure; a map's size and look-up time"
 
-PARTS = "recorded", "town", "loop", "alike", "gnss", "size"
+PARTS = "recorded", "loop", "gnss", "size"
+Seen = tuple[Estimate, NDArray[np.uint8]]
 BASELINE_M = 0.537  # between the cameras of the two passes
 OTHERS = ("kitti_odometry/sequences/00", "kitti_odometry/sequences/06", "kitti_tracking/training/image_03/0005")
 
@@ -46,26 +48,28 @@ def run(arguments: list[str]) -> None:
     add_data(parser)
     parser.add_argument("--part", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--features", nargs="+", choices=list(FeatureKind), default=[FeatureKind.SIFT])
-    parser.add_argument(
-        "--drives", type=Path, default=Path("out/town"), metavar="DIR", help="folder of the rendered town"
-    )
     parser.add_argument("--way", type=float, default=2000.0, metavar="M", help="length of the simulated loop")
-    parser.add_argument("--equal-houses", type=float, default=5000.0, metavar="M", help="their length")
     options = parser.parse_args(arguments)
     cv2.setNumThreads(1)
     with Ledger(options.output, label, features=[str(kind) for kind in options.features], way_m=options.way) as ledger:
         if "recorded" in options.part:
             recorded(ledger, options.data, [FeatureKind(kind) for kind in options.features])
-        if "town" in options.part:
-            town.measure(ledger, options.drives)
         if "loop" in options.part:
             simulated.loop(ledger, options.way)
-        if "alike" in options.part:
-            simulated.alike(ledger, options.equal_houses)
         if "gnss" in options.part:
             simulated.gnss(ledger, options.way)
         if "size" in options.part:
             simulated.size(ledger)
+
+
+def estimated(uri: str) -> Iterator[Seen]:
+    """The estimates of the whole pipeline for a recording, with the undistorted images."""
+    recording, frames = open_recorded(uri), open_recorded(uri).undistorted_frames()
+    with pipeline(load(None, {"source.uri": uri})) as through:
+        for estimate in (record for record in through(recording) if isinstance(record, Estimate)):
+            frame = next(each for each in frames if each.frame_id == estimate.frame_id)
+            if frame.image is not None:
+                yield estimate, frame.image
 
 
 def recorded(ledger: Ledger, data: Path, kinds: Sequence[FeatureKind]) -> None:

@@ -1,8 +1,7 @@
-"""Simulated features of streets with exact truth: a loop, equal houses, GNSS fixes, maps of 100 km."""
+"""Simulated features of streets with exact truth: a loop, GNSS fixes, maps of 100 km."""
 
 from __future__ import annotations
 
-import math
 import tempfile
 import time
 from pathlib import Path
@@ -18,12 +17,11 @@ from birdslam.loops.gnss.earth import GnssFix
 from birdslam.loops.keyframe import Keyframe
 from birdslam.loops.keyframe_builder import MAX_POINTS, SPACING_M
 from birdslam.loops.localiser import Localisation
-from birdslam.loops.map_file import decode_map, encode_map
-from birdslam.loops.map_pose import MapState
+from birdslam.loops.map_file import encode_map
 from birdslam.loops.place_map import MapCamera, PlaceMap
 from birdslam.loops.session import MapSession
 from birdslam.outputs.placed import Place
-from birdslam.perf.maps.places import CAMERA, OTHER_LIGHT_BITS, SAME_BITS, Street, along, block, build, drive
+from birdslam.perf.maps.places import CAMERA, SAME_BITS, block, build, drive
 from birdslam.perf.reporting.figures import Ledger
 from birdslam.runtime.maps.drive_earth import write_earth
 from birdslam.types import NS_PER_S, Attitude
@@ -31,11 +29,10 @@ from birdslam.types import NS_PER_S, Attitude
 LENGTHS_KM = 1, 10, 100
 LOOK_UPS = 20
 ORIGIN, FIX_M = (51.05, -114.05), 2.5
-LEG_M, CORNER_M = 400, 19  # winding street of equal houses: straight legs, and corners of 12 m radius
 
 
 def loop(ledger: Ledger, way_m: float) -> None:
-    """A loop driven twice, then localization in its map."""
+    """A loop driven twice."""
     street = build(block(way_m / 4.0), seed=1)
     around = len(street.route)
     place_map = PlaceMap(MapCamera.of(CAMERA))
@@ -43,9 +40,8 @@ def loop(ledger: Ledger, way_m: float) -> None:
     ends: list[tuple[SE2, SE2, Localisation]] = []
     truth: dict[int, SE2] = {}
     odometry: dict[int, SE2] = {}
-    first: SE2 | None = None
+    first = SE2(*street.route[0].tolist())
     for estimate, seen, T in drive(street, range(2 * around), seed=5):
-        first = first or T
         truth[estimate.t_source_ns] = first.between(T)
         odometry[estimate.t_source_ns] = estimate.T_world_ego
         ends.append((truth[estimate.t_source_ns], estimate.T_world_ego, session.step(estimate, seen)))  # type: ignore[arg-type]
@@ -76,43 +72,6 @@ def loop(ledger: Ledger, way_m: float) -> None:
         f"{unscaled_m:.2f} m after scaling by {scale:.4f}"
     )
     ledger.add(f"loop of {around} m, twice", text, **row, text=text)
-    kept = encode_map(place_map)
-    rows = range(around // 4, around // 4 + 300)
-    for name, lateral_m, bits in (
-        ("same lane and light", 0.0, SAME_BITS),
-        ("other lane, 3 m", 3.0, SAME_BITS),
-        ("other light", 0.0, OTHER_LIGHT_BITS),
-        ("other light and lane", 3.0, OTHER_LIGHT_BITS),
-    ):
-        share, worst_m = _localise_again(kept, street, rows, lateral_m, bits, first or SE2())
-        text = f"{100 * share:.0f} % localised, worst {worst_m:.2f} m"
-        ledger.add(f"loop: {name}", text, localised=share, worst_m=worst_m, text=text)
-
-
-def alike(ledger: Ledger, equal_m: float) -> None:
-    """Streets of equal houses: a straight one, and a winding one whose legs look alike."""
-    straight = [0.0] * round(equal_m + 70.0)
-    for name, turns in (("straight", straight), ("winding", _winding(len(straight)))):
-        houses = build(along(turns), seed=3, house_m=20.0)
-        session = _session(PlaceMap(MapCamera.of(CAMERA)), extend=True)
-        localised = 0
-        for estimate, seen, _ in drive(houses, range(round(equal_m)), seed=5):
-            localised += session.step(estimate, seen).state is MapState.LOCALISED  # type: ignore[arg-type]
-        session.finish()
-        false = sum(link.loop for link in session.map.links)
-        text = f"{false} false closures in {equal_m / 1e3:g} km, {localised} frames falsely localised"
-        ledger.add(f"equal houses, {name}", text, false=false, localised=localised, way_m=equal_m, text=text)
-
-
-def _winding(count: int) -> list[float]:
-    """Turn per metre: alternately two corners to the left and two to the right."""
-    out: list[float] = []
-    side = 1.0
-    while len(out) < count:
-        for straight in (LEG_M, LEG_M // 10):
-            out += [0.0] * straight + [side * math.pi / 2.0 / CORNER_M] * CORNER_M
-        side = -side
-    return out[:count]
 
 
 def gnss(ledger: Ledger, way_m: float) -> None:
@@ -165,22 +124,6 @@ def _session(place_map: PlaceMap, extend: bool) -> MapSession:
 
 def _distance_m(a: SE2, b: SE2) -> float:
     return float(np.hypot(a.x_m - b.x_m, a.y_m - b.y_m))
-
-
-def _localise_again(
-    kept: bytes, street: Street, rows: range, lateral_m: float, bits: float, first: SE2
-) -> tuple[float, float]:
-    """The share of localised frames, and their worst error relative to the nearest keyframe."""
-    session = _session(decode_map(kept), extend=False)
-    frames, errors = 0, [0.0]
-    localised_frames = 0
-    for estimate, seen, T in drive(street, rows, 9, lateral_m, bits):
-        found = session.step(estimate, seen)  # type: ignore[arg-type]
-        frames += 1
-        if found.state is MapState.LOCALISED and found.T_map_ego is not None:
-            localised_frames += 1
-            errors.append(_distance_m(found.T_map_ego, first.between(T)))
-    return round(localised_frames / frames, 3), round(max(errors), 3)
 
 
 def size(ledger: Ledger) -> None:
