@@ -1,11 +1,9 @@
 """Consistency of the scale of one video at other sizes, rates, compressions, with obstructions, and later starts.
 
-    python -m perf films [FILM ...] [--part PART ...] [--seconds S] [--begin-at S ...] [--output DIR] [--data DIR]
+    python -m perf films [FILM ...] [--part PART ...] [--seconds S] [--begin-at S ...] [--output FILE.json] [--data DIR]
                          [--networks] [--model ROLE=PATH ...]
-    python -m perf films FILM --run DIR     # evaluates the results of `birdslam run --output DIR`
-    python -m perf films [FILM ...] --calibrate --output DIR     # only writes new camera files (CAMERAS)
 
-The odometry processes each variant (film_variants.py) with the same fixed camera file.
+The odometry processes each variant (film_variants.py) with the same fixed camera file of CAMERAS.
 """
 
 from __future__ import annotations
@@ -13,7 +11,7 @@ from __future__ import annotations
 import argparse
 import math
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +23,6 @@ from numpy.typing import NDArray
 from birdslam.bench.ego.trajectory_errors import from_first
 from birdslam.geometry.camera import Camera, Undistorter
 from birdslam.odometry.odometry import Odometry
-from birdslam.outputs.drive_files import FRAMES_FILE
 from birdslam.perception import ModelError
 from birdslam.perf.accuracy.drives import is_valid, networks_of
 from birdslam.perf.errors import PerfError
@@ -35,18 +32,12 @@ from birdslam.perf.robustness.film_figures import (
     BEGINNING_S,
     Course,
     TrueSpeed,
-    course_of_run,
-    draw,
     over,
-    page,
     row_text,
     summary,
 )
 from birdslam.perf.robustness.film_variants import PARTS, Timed, Variant, variants
-from birdslam.runtime.calibration.drive import ROUGH, calibrate_drive
-from birdslam.runtime.calibration.given import Given
-from birdslam.runtime.calibration.report import write_camera_file
-from birdslam.runtime.configuration import Configuration, complete, load
+from birdslam.runtime.configuration import Configuration, complete
 from birdslam.runtime.nodes.inference import Inference
 from birdslam.sources.camera_file import load_camera
 from birdslam.sources.opening import open_recording
@@ -64,48 +55,36 @@ SECONDS = 5.0  # duration of each variant
 
 @dataclass(frozen=True)
 class Film:
-    """A video: its source, the known camera parameters, and its truth."""
+    """A video: its source and its truth."""
 
     uri: str  # {data} is the folder of data
-    height_m: float | None = None
-    fov_deg: float | None = None
-    chessboard: str | None = None  # folder of its images
     gps: str | None = None  # file of times and speeds
     speed_mps: float | None = None  # constant speed
     between_mps: tuple[float, float] | None = None  # bounds of its speed
 
-    def given(self, data: Path) -> Given:
-        board = None if self.chessboard is None else data / self.chessboard
-        return Given(height_m=self.height_m, fov_deg=self.fov_deg, chessboard=board)
-
 
 FILMS = {
-    "town": Film("video:{data}/dashcam/town.mp4", height_m=1.35, fov_deg=60.0, gps="dashcam/town_gps.csv"),
+    "town": Film("video:{data}/dashcam/town.mp4", gps="dashcam/town_gps.csv"),
     # The field of view that matches GPS: not a test of the scale, but of the rest
-    "town_72": Film("video:{data}/dashcam/town.mp4", height_m=1.35, fov_deg=72.0, gps="dashcam/town_gps.csv"),
-    "motorway": Film(
-        "video:{data}/highway/solidWhiteRight.mp4", height_m=1.25, chessboard="highway/camera_cal", speed_mps=25.4
-    ),
-    "rain": Film("video:{data}/dashcam/rain.mp4", height_m=1.3, fov_deg=60.0, between_mps=(15.0, 35.0)),
+    "town_72": Film("video:{data}/dashcam/town.mp4", gps="dashcam/town_gps.csv"),
+    "motorway": Film("video:{data}/highway/solidWhiteRight.mp4", speed_mps=25.4),
+    "rain": Film("video:{data}/dashcam/rain.mp4", between_mps=(15.0, 35.0)),
     "00": Film("kitti:{data}/kitti_odometry/sequences/00"),
     "0005": Film("kitti:{data}/kitti_tracking/training/image_03/0005"),
     "06": Film("kitti:{data}/kitti_odometry/sequences/06"),
     "01": Film("kitti:{data}/kitti_odometry/sequences/01"),
 }
 DEFAULT = ("town", "town_72", "motorway", "00", "0005")
-# A camera file for each film without one, written by `--calibrate`. Fixed, so that the tables compare variants and not
-# calibrations
+# Camera files of `birdslam calibrate`, fixed, so that the table compares variants and not calibrations
 CAMERAS = Path(__file__).resolve().parents[1] / "film_cameras"
 
 
 def run(arguments: list[str]) -> None:
-    parser = benchmark_parser("films", label, output="folder of films.json, films.md and films.png")
+    parser = benchmark_parser("films", label)
     parser.add_argument("films", nargs="*", metavar="FILM", help=f"of {', '.join(FILMS)}")
     parser.add_argument("--part", action="append", choices=PARTS, help="only this part; repeatable")
     parser.add_argument("--begin-at", type=float, nargs="+", metavar="S", help="start times in the film")
     parser.add_argument("--seconds", type=float, default=SECONDS, help="duration of each variant")
-    parser.add_argument("--calibrate", action="store_true", help="calibrate the films' cameras into --output")
-    parser.add_argument("--run", type=Path, metavar="DIR", help="evaluate the results of `birdslam run` in DIR")
     add_data(parser)
     add_networks(parser)
     options = parser.parse_args(arguments)
@@ -114,28 +93,15 @@ def run(arguments: list[str]) -> None:
         raise PerfError(f"{', '.join(sorted(unknown))}: unknown film; expected one of {', '.join(FILMS)}")
     cv2.setNumThreads(1)
     try:
-        if options.run is not None:
-            print(text_of_run(options.run, options.films, options.data))
-            return
-        if options.calibrate:
-            if options.output is None:
-                raise PerfError("--calibrate needs --output, the folder of the camera files")
-            calibrate_films(options.films or FILMS, options.data, options.output)
-            return
-        rows = measure_all(options)
+        measure_all(options)
     except (DatasetError, ModelError) as error:
         raise PerfError(str(error)) from error
-    if options.output is not None:
-        (options.output / "films.md").write_text(page(rows), encoding="utf-8")
-        draw(rows, options.output / "films.png")
-        print(f"results in {options.output}")
 
 
-def measure_all(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """A row for each variant of each part of each film."""
-    output, configuration = options.output, networks_of(options)
-    path = None if output is None else output / "films.json"
-    with Ledger(path, label, seconds=options.seconds, networks=configuration is not None) as ledger:
+def measure_all(options: argparse.Namespace) -> None:
+    """Measures each variant of each part of each film."""
+    configuration = networks_of(options)
+    with Ledger(options.output, label, seconds=options.seconds, networks=configuration is not None) as ledger:
         for name in options.films or DEFAULT:
             film = FILMS[name]
             camera = camera_of(name)
@@ -158,39 +124,12 @@ def measure_all(options: argparse.Namespace) -> list[dict[str, Any]]:
                         ledger.add(
                             f"{name}: {variant.name}{started}", row_text(figures), film=name, part=part, **figures
                         )
-        rows: list[dict[str, Any]] = ledger.content["rows"]
-    return rows
 
 
 def camera_of(name: str) -> Camera | None:
     """The fixed camera of a film; None for a recording with a camera file."""
-    return None if FILMS[name].height_m is None else load_camera(CAMERAS / f"{name}.toml")
-
-
-def calibrate_films(names: Iterable[str], data: Path, output: Path) -> None:
-    """Writes a camera file for each film without one, calibrated as by `birdslam run`."""
-    for name in names:
-        film = FILMS[name]
-        if film.height_m is None:
-            continue
-        found = calibrate_drive(
-            load(None, {}), film.uri.format(data=data), film.given(data), config=ROUGH, must_show=False
-        )
-        write_camera_file(output / f"{name}.toml", found.camera, found.report)
-        print(f"{output / name}.toml")
-
-
-def text_of_run(folder: Path, films: list[str], data: Path) -> str:
-    """Evaluates the results of a run of one film against its truth. Raises PerfError, DatasetError."""
-    if len(films) != 1:
-        raise PerfError("--run needs the name of its film")
-    if not (folder / FRAMES_FILE).is_file():
-        raise PerfError(f"{folder / FRAMES_FILE} does not exist; `birdslam run --output DIR` writes it")
-    film = FILMS[films[0]]
-    recording = open_recording(film.uri.format(data=data)) if film.height_m is None else None
-    course = course_of_run(folder / FRAMES_FILE, truth(film, recording, data))
-    figures = summary(course, film.between_mps or (0.0, math.inf))
-    return f"{films[0]}: {figures['valid']:.1%} of {figures['frames']} frames valid  {row_text(figures)}"
+    path = CAMERAS / f"{name}.toml"
+    return load_camera(path) if path.is_file() else None
 
 
 def drive(
@@ -250,7 +189,7 @@ def _at_size(seen: Seen, given: Camera, camera: Camera) -> Seen:
     return boxes_px, road
 
 
-def truth(film: Film, recording: Recording | None, data: Path) -> TrueSpeed:
+def truth(film: Film, recording: Recording, data: Path) -> TrueSpeed:
     """The true speed, from the film or from the recording's poses. Raises DatasetError."""
     if film.speed_mps is not None:
         speed_mps = film.speed_mps
@@ -261,8 +200,8 @@ def truth(film: Film, recording: Recording | None, data: Path) -> TrueSpeed:
     if film.gps is not None:
         t_s, *_, mps = np.loadtxt(data / film.gps, delimiter=",", skiprows=1).T
         return lambda begin_s, end_s: float(np.interp(0.5 * (begin_s + end_s), t_s, mps))
-    rows = None if recording is None else recording.truth_poses()
-    if recording is None or rows is None:
+    rows = recording.truth_poses()
+    if rows is None:
         raise DatasetError(f"{film.uri}: has no truth")
     T = recording.T_cam0_cam()
     at_m = from_first(inverse(T) @ as_poses(rows) @ T)[:, :3, 3]

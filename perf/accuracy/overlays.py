@@ -16,13 +16,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from birdslam.bench.ego import truth_quality
 from birdslam.geometry.arrays import Image
 from birdslam.odometry.odometry import Odometry
 from birdslam.odometry.plausibility import PlausibilityConfig
 from birdslam.perception import ModelError
 from birdslam.perf.accuracy.drives import (
-    SPEED_LIMIT,
     Drive,
     Task,
     add_drive_options,
@@ -51,7 +49,7 @@ KINDS = (*windscreen.KINDS, "night")
 BEGINS = {"from the start": 0.0, "from the middle": 0.5}  # at which share of the images
 NIGHT_IMAGES = 30
 _COUNTS = (
-    "frames", "valid", "wrong_valid", "wrong_valid_truth_doubtful", "wrong_over_three", "standstill", "obstructed",
+    "frames", "valid", "wrong_valid", "standstill", "obstructed"
 )  # fmt: skip
 MIN_DRIVING_M = 0.1  # true motion per image of a car that is not stationary
 
@@ -106,10 +104,8 @@ def measure(drive: Drive, share: float = 0.5) -> dict[str, Any]:
     """Results of the odometry for the images after a fraction of the sequence."""
     odometry, first = Odometry(drive.camera), int(share * len(drive.images))
     blind_ns, measured_ns = round(PlausibilityConfig().blind_s * NS_PER_S), drive.t_ns[0]
-    doubtful = truth_quality.doubtful(drive.poses, np.array(drive.t_ns, np.int64))
     row = dict.fromkeys(_COUNTS, 0)
     way_m = true_m = 0.0
-    ways: dict[int, tuple[float, float, bool]] = {}  # by frame: estimated and true distance, and whether it is wrong
     for k, image in enumerate(drive.images):
         motion = odometry.estimate(odometry.track(image), k, drive.t_ns[k], *drive.seen[k])
         if motion is None:
@@ -123,34 +119,19 @@ def measure(drive: Drive, share: float = 0.5) -> dict[str, Any]:
         row["frames"] += 1
         length_m = float(np.linalg.norm(motion.t_prev_curr_m))
         row["valid"] += valid
-        wrong = valid and is_wrong(motion, drive.poses)
-        row["wrong_valid"] += wrong
-        row["wrong_valid_truth_doubtful"] += wrong and bool(doubtful[k])
-        ways[k] = length_m, step_m, wrong
+        row["wrong_valid"] += valid and is_wrong(motion, drive.poses)
         row["standstill"] += motion.standstill and step_m > MIN_DRIVING_M * (k - motion.from_frame)
         row["obstructed"] += Status.VIEW_OBSTRUCTED in motion.status
         if motion.from_frame == k - 1:
             way_m, true_m = way_m + length_m, true_m + step_m
-    row["wrong_over_three"] = sum(wrong and _is_wrong_over_three(ways, k) for k, (*_, wrong) in ways.items())
     return {**row, "scale_error": way_m / true_m - 1.0 if true_m else None}
-
-
-def _is_wrong_over_three(ways: dict[int, tuple[float, float, bool]], k: int) -> bool:
-    """Whether the distance over three images around frame k exceeds the limit of the speed error.
-
-    KITTI's true steps are uneven, since GPS/IMU samples are up to 10 ms off the images. Three steps average this.
-    """
-    about = sorted(ways, key=lambda frame: abs(frame - k))[:3]
-    way_m, true_m = (sum(ways[frame][which] for frame in about) for which in (0, 1))
-    return abs(way_m - true_m) > SPEED_LIMIT * true_m
 
 
 def row_text(row: dict[str, Any]) -> str:
     """A row as text."""
     scale = "unknown" if row["scale_error"] is None else f"{row['scale_error']:+.1%}"
     return (
-        f"{row['frames']:4} frames  valid {row['valid']}, of them wrong {row['wrong_valid']} "
-        f"({row['wrong_valid_truth_doubtful']} where the truth is doubtful, over three images too "
-        f"{row['wrong_over_three']})  standstill {row['standstill']}  "
+        f"{row['frames']:4} frames  valid {row['valid']}, of them wrong {row['wrong_valid']}  "
+        f"standstill {row['standstill']}  "
         f"view_obstructed {row['obstructed']}  scale {scale}"
     )

@@ -5,7 +5,7 @@
 A NAME is a road of `world/roads.py` or `demo`, optionally with one of EFFECTS after a plus (`motorway_30+drops`);
 default: all, and the effects on two of them. Rendered from its seed (extra `train`), or read from `--drives`. The
 odometry runs with the true boxes, from each image of `--begin-at` to the end, and cold from every `--every`-th. Writes
-roads.json, report.md and roads.png.
+roads.json and report.md.
 """
 
 from __future__ import annotations
@@ -34,7 +34,6 @@ from birdslam.perf.accuracy.drives import (
     follow,
     is_valid,
 )
-from birdslam.perf.accuracy.starts import draw
 from birdslam.perf.errors import PerfError
 from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
@@ -61,7 +60,7 @@ COLUMNS = ("road", "m/s", "Hz", "ways", "rotation", "valid", "of them wrong", "s
 
 
 def run(arguments: list[str]) -> None:
-    parser = benchmark_parser("roads", label, output="folder of roads.json, roads.png and report.md")
+    parser = benchmark_parser("roads", label, output="folder of roads.json and report.md")
     parser.add_argument("names", nargs="*", metavar="NAME", help="road, or ROAD+EFFECT")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="write each rendered drive to DIR/NAME")
     parser.add_argument("--drives", type=Path, metavar="DIR", help="use the drives in DIR; do not render")
@@ -95,7 +94,6 @@ def run(arguments: list[str]) -> None:
     rows = ledger.content["rows"]
     if options.output is not None and rows:
         (options.output / "report.md").write_text(report(rows), encoding="utf-8")
-        draw(rows, options.output / "roads.png")
         print(f"results in {options.output}")
 
 

@@ -1,20 +1,17 @@
 """Cold starts of the ego-motion along recorded drives: errors of scale and rotation over the distance travelled.
 
-    python -m perf starts [SEQUENCE ...] [--output DIR] [--data DIR] [--networks] [--model ROLE=PATH ...]
+    python -m perf starts [SEQUENCE ...] [--output FILE.json] [--data DIR] [--networks] [--model ROLE=PATH ...]
 
 From every `--every`-th image of each sequence (kitti:DIR, or a folder of `--data`) the odometry starts again, and runs
-over `--images` images: as recorded, mirrored left to right, and over every second image. Writes starts.json, a row for
-each sequence and variant with the curves of every start, and starts.png.
+over `--images` images: as recorded, mirrored left to right, and over every second image.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import cv2
-import matplotlib
 import numpy as np
 
 from birdslam.bench.ego import truth_quality
@@ -37,9 +34,6 @@ from birdslam.perf.reporting.figures import Ledger
 from birdslam.runtime.process.workers import workers
 from birdslam.sources.recording import DatasetError
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-
 label = "cold starts along recorded drives: errors of scale and rotation over the distance travelled"
 
 VARIANTS = (("as recorded", False, 1), ("mirrored", True, 1), ("every second image", False, 2))
@@ -47,7 +41,7 @@ _COUNTS = ("n", "over_limit", "wrong_valid", "wrong_valid_truth_doubtful")
 
 
 def run(arguments: list[str]) -> None:
-    parser = benchmark_parser("starts", label, output="folder of starts.json and starts.png")
+    parser = benchmark_parser("starts", label)
     add_drive_options(parser)
     parser.add_argument("--every", type=int, default=5, help="images between starts")
     parser.add_argument("--images", type=int, default=25, help="images per start")
@@ -61,10 +55,9 @@ def run(arguments: list[str]) -> None:
         for sequence in options.sequences or SEQUENCES
         for name, mirrored, stride in VARIANTS
     ]
-    path = None if options.output is None else options.output / "starts.json"
     settings = {"every": options.every, "images": options.images, "networks": configuration is not None}
     try:
-        with Ledger(path, label, **settings) as ledger, workers(min(options.jobs, len(tasks))) as pool:
+        with Ledger(options.output, label, **settings) as ledger, workers(min(options.jobs, len(tasks))) as pool:
             for task, (sequence, starts) in zip(tasks, pool.map(measure, tasks), strict=True):
                 figures = summary(starts)
                 ledger.add(f"{sequence} {task.name}", row_text(figures), **figures, starts=starts)
@@ -78,9 +71,6 @@ def run(arguments: list[str]) -> None:
         f"{total['wrong_valid']} valid frames with a speed error over {SPEED_LIMIT:.0%}, "
         f"{total['wrong_valid_truth_doubtful']} of them with doubtful truth"
     )
-    if options.output is not None:
-        draw(rows, options.output / "starts.png")
-        print(f"results in {options.output}")
 
 
 def measure(task: Task) -> tuple[str, list[dict[str, Any]]]:
@@ -137,23 +127,3 @@ def row_text(figures: dict[str, Any]) -> str:
         "interpolated or accelerates as no car does)"
         + f"; {figures['over_limit_interpolated']} of those over begin where the truth is interpolated"
     )
-
-
-def draw(rows: Sequence[dict[str, Any]], path: Path) -> None:
-    """Draws a line per start."""
-    figure, grid = plt.subplots(len(rows), 2, figsize=(12, 2.2 * len(rows)), squeeze=False, sharex=True)
-    for row, (scale, rotation) in zip(rows, grid, strict=True):
-        for start in row["starts"]:
-            scale.plot(start["true_way_m"], 100.0 * np.array(start["scale_error"]), linewidth=0.8)
-            rotation.plot(start["true_way_m"], start["rotation_error_deg"], linewidth=0.8)
-        for side in (-1.0, 1.0):
-            scale.axhline(side * 100.0 * SCALE_LIMIT, color="k", linestyle=":", linewidth=1)
-        scale.set(ylabel="distance error, %", ylim=(-30, 30), title=row["name"])
-        rotation.set(ylabel="rotation error, deg", ylim=(0, 5))
-    for axes in grid.ravel():
-        axes.grid(True, alpha=0.3)
-    for axes in grid[-1]:
-        axes.set_xlabel("true distance since the start, m")
-    figure.tight_layout()
-    figure.savefig(path, dpi=70)
-    plt.close(figure)

@@ -1,26 +1,16 @@
-"""Results of the ego-motion of a film: valid frames, time of the first, speed relative to the truth; table and plot."""
+"""Results of the ego-motion of a film: valid frames, time of the first, speed relative to the truth."""
 
 from __future__ import annotations
 
-import csv
-import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
-
-from birdslam.types import Status
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 
 TrueSpeed = Callable[[float, float], float]  # m/s between two times in s of the recording
 
 BEGINNING_S = 2.0  # time after which estimates should be valid
-ALIKE = 0.03  # max. relative difference of distance between variants of one film
 MIN_SPEED_MPS = 1.0  # below it a ratio of speeds is meaningless
 
 
@@ -57,21 +47,6 @@ class Course:
         self.valid.append(valid)
         self.sigma_rel.append(sigma_rel)
         self.stands.append(stands)
-
-
-def course_of_run(path: Path, true_mps: TrueSpeed) -> Course:
-    """Reads the frames.csv of `birdslam run`."""
-    course = Course()
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
-    for before, row in itertools.pairwise(rows):
-        if row["speed_mps"]:
-            t_s, end_s = float(before["t_s"]), float(row["t_s"])
-            at_s = end_s - float(rows[0]["t_s"])
-            valid, stands = row["valid"] == "1", Status.STANDSTILL.value in row["status"].split()
-            speed_mps, sigma_rel = float(row["speed_mps"]), float(row["scale_sigma_rel"])
-            course.add(at_s, end_s - t_s, speed_mps, true_mps(t_s, end_s), valid, sigma_rel, stands)
-    return course
 
 
 def summary(course: Course, between_mps: tuple[float, float] = (0.0, np.inf)) -> dict[str, Any]:
@@ -141,70 +116,3 @@ def row_text(figures: dict[str, Any]) -> str:
 
 def _text(figure: float | None, form: str) -> str:
     return "-" if figure is None else format(figure, form)
-
-
-def page(rows: list[dict[str, Any]]) -> str:
-    """The rows as a page with a table per part."""
-    lines = [
-        "# Variants of films",
-        "",
-        "Consistency of the scale of each recording at other sizes and rates, with H.264, with obstructions, and with",
-        "later starts (`python -m perf films`). Valid frames and speed count after the first 2 s; *over* is the ratio",
-        "of speed to that of the unchanged film, the median over seconds; *deviation* is the median absolute deviation",
-        "of the ratio of speed to truth. `town`: the truth is GPS at 1 Hz, in whole km/h; its lens is unknown, so a",
-        "constant factor is due to its focal length and height. `town_72` uses the field of view that matches GPS",
-        "instead of the stated 60 degrees. For `rain` only bounds of the speed are known, 15 to 35 m/s. *Beyond* are",
-        "seconds with a distance error over two stated sigma, including the camera's; *standstill* are images with",
-        "this status while the car moves, *outside* valid ones with an impossible speed. All variants of a film use",
-        "one camera file (`perf/film_cameras`). *Noise* adds noise of 1.5 grey levels to each pixel: smaller",
-        "differences between variants are not significant.",
-    ]
-    for part in dict.fromkeys(row["part"] for row in rows):
-        chosen = [row for row in rows if row["part"] == part]
-        lines += [
-            *("", f"## {part.capitalize()}", "", *_spread(chosen)),
-            "| film | valid after 2 s | first valid, s | speed over truth | deviation | over | beyond, s | standstill |"
-            " outside |",
-            "|---|---|---|---|---|---|---|---|---|",
-        ]
-        lines += [
-            (
-                f"| {row['name']} | {row['valid_after_2_s']:.0%} | {_text(row['first_valid_s'], '.2f')} | "
-                f"{_text(row['speed_over_truth'], '.3f')} | {_text(row['deviation'], '.1%')} | "
-                f"{_text(row['way_over_unchanged'], '.3f')} | {row['beyond_s']} | {row['standstill']} | "
-                f"{row['outside']} |"
-            )
-            for row in chosen
-        ]
-    return "\n".join(lines) + "\n"
-
-
-def _spread(rows: list[dict[str, Any]]) -> list[str]:
-    """For each film the range of its variants relative to the unchanged one."""
-    out = []
-    for film in dict.fromkeys(row["film"] for row in rows):
-        ratios = [row["way_over_unchanged"] for row in rows if row["film"] == film]
-        known = [ratio for ratio in ratios if ratio is not None]
-        if not known:
-            continue
-        inside = sum(abs(ratio - 1.0) <= ALIKE for ratio in known)
-        out.append(f"- {film}: {min(known):.3f} to {max(known):.3f}, {inside} of {len(ratios)} within {ALIKE:.0%}")
-    return [*out, ""] if out else []
-
-
-def draw(rows: list[dict[str, Any]], path: Path) -> None:
-    """Draws speed over truth by seconds, a panel per part and film."""
-    panels = list(dict.fromkeys((row["film"], row["part"]) for row in rows))
-    figure, axes = plt.subplots(len(panels), 1, figsize=(10, 2.6 * len(panels)), squeeze=False)
-    for (film, part), panel in zip(panels, axes[:, 0], strict=True):
-        for row in rows:
-            if (row["film"], row["part"]) == (film, part):
-                ratio = [np.nan if value is None else value for value in row["by_second"]]
-                name = row["name"].partition(": ")[2]
-                panel.plot(np.arange(len(ratio)) + 0.5, ratio, marker=".", label=name, linewidth=1)
-        panel.set(title=f"{film}: {part}", xlabel="s", ylabel="speed over truth", ylim=(0.5, 1.6))
-        panel.legend(fontsize=6, ncols=3)
-        panel.grid(True, alpha=0.3)
-    figure.tight_layout()
-    figure.savefig(path, dpi=90)
-    plt.close(figure)
