@@ -1,4 +1,4 @@
-"""1-sigma of box edges by detector family, measured by `python -m perf box_edges` on KITTI tracking (docs/networks.md).
+"""1-sigma of box edges by detector family, measured on KITTI tracking (docs/networks.md).
 
 A mean offset of an edge is part of its sigma, since boxes are not corrected.
 """

@@ -1,4 +1,4 @@
-"""Transports between processes, ours and alternatives; each sends a time-stamped array.
+"""Transports between processes, ours and plain zenoh; each sends a time-stamped array.
 
     python -m birdslam.perf.latency.carriers listen|send CARRIER PLACE BYTES RATE_HZ MESSAGES
 
@@ -8,7 +8,6 @@ The latency is the time from before the first byte is written until the receiver
 from __future__ import annotations
 
 import json
-import socket
 import struct
 import sys
 import threading
@@ -26,7 +25,6 @@ from birdslam.runtime.wire import Stage, Trace
 from birdslam.types import FrameRef, MapUpdate
 
 _STAMP = struct.Struct("<qq")  # time sent (CLOCK_MONOTONIC ns), sequence number
-_LENGTH = struct.Struct("<I")
 _VEHICLE = "perf"
 _EMPTY_BYTES, _POINT_BYTES = 40, 19  # of a MapUpdate as MessagePack
 _MATCH_S = 10.0
@@ -154,10 +152,10 @@ def _require(ready: bool) -> None:
 
 
 class _ZenohListener:
-    """zenoh over a unix socket, with or without its shared memory."""
+    """zenoh over a unix socket."""
 
-    def __init__(self, place: Path, size: int, arrived: Arrived, shm: bool = False) -> None:
-        self._session = zenoh.open(_zenoh_config("listen", place, shm))
+    def __init__(self, place: Path, size: int, arrived: Arrived) -> None:
+        self._session = zenoh.open(_zenoh_config("listen", place))
 
         def receive(sample: zenoh.Sample) -> None:
             data = np.frombuffer(sample.payload.to_bytes(), dtype=np.uint8)
@@ -170,9 +168,9 @@ class _ZenohListener:
 
 
 class _ZenohSender:
-    def __init__(self, place: Path, size: int, shm: bool = False) -> None:
+    def __init__(self, place: Path, size: int) -> None:
         self._data = np.random.default_rng(1).integers(0, 256, size, dtype=np.uint8)
-        self._session = zenoh.open(_zenoh_config("connect", place, shm))
+        self._session = zenoh.open(_zenoh_config("connect", place))
         self._out = self._session.declare_publisher(
             "perf/bytes",
             congestion_control=zenoh.CongestionControl.DROP,
@@ -193,13 +191,13 @@ class _ZenohSender:
         self._session.close()
 
 
-def _zenoh_config(role: str, place: Path, shm: bool) -> zenoh.Config:
+def _zenoh_config(role: str, place: Path) -> zenoh.Config:
     settings = {
         "mode": "peer",
         f"{role}/endpoints": [f"unixsock-stream/{place / 'zenoh.sock'}"],
         "scouting/multicast/enabled": False,
         "transport/link/protocols": ["unixsock-stream"],
-        "transport/shared_memory/enabled": shm,
+        "transport/shared_memory/enabled": False,
     }
     if role == "connect":
         settings["listen/endpoints"] = []
@@ -209,53 +207,10 @@ def _zenoh_config(role: str, place: Path, shm: bool) -> zenoh.Config:
     return config
 
 
-class _SocketListener:
-    """A unix stream socket: a length, then the bytes."""
-
-    def __init__(self, place: Path, size: int, arrived: Arrived) -> None:
-        self._listening = socket.socket(socket.AF_UNIX)
-        self._listening.bind(str(place / "plain.sock"))
-        self._listening.listen(1)
-        self._arrived = arrived
-        threading.Thread(target=self._run, daemon=True).start()
-
-    def _run(self) -> None:
-        stream, _ = self._listening.accept()
-        with stream:
-            while head := stream.recv(_LENGTH.size, socket.MSG_WAITALL):
-                data = np.empty(_LENGTH.unpack(head)[0], dtype=np.uint8)
-                if stream.recv_into(data.data, data.size, socket.MSG_WAITALL) < data.size:
-                    return
-                self._arrived(*_STAMP.unpack_from(data.data))
-
-    def close(self) -> None:
-        self._listening.close()
-
-
-class _SocketSender:
-    def __init__(self, place: Path, size: int) -> None:
-        self._data = np.random.default_rng(1).integers(0, 256, size, dtype=np.uint8)
-        self._stream = socket.socket(socket.AF_UNIX)
-        self._stream.connect(str(place / "plain.sock"))
-
-    def send(self, number: int) -> None:
-        _STAMP.pack_into(self._data.data, 0, time.monotonic_ns(), number)
-        self._stream.sendall(_LENGTH.pack(self._data.size))
-        self._stream.sendall(self._data.data)
-
-    def close(self) -> None:
-        self._stream.close()
-
-
 CARRIERS: dict[str, tuple[Callable[..., Listener], Callable[..., Sender]]] = {
     "ring": (_RingListener, _RingSender),
     "bus": (_BusListener, _BusSender),
     "zenoh": (_ZenohListener, _ZenohSender),
-    "zenoh-shm": (
-        lambda place, size, arrived: _ZenohListener(place, size, arrived, shm=True),
-        lambda place, size: _ZenohSender(place, size, shm=True),
-    ),
-    "unix-socket": (_SocketListener, _SocketSender),
 }
 
 

@@ -16,15 +16,12 @@ from birdslam.types import LandmarkEdge, Measurements
 
 _PRIOR = gtsam.noiseModel.Isotropic.Sigma(3, 1e-3)
 _RELINEARIZE_SKIP = 10
-_FREE_RAD = 1e3  # landmarks summed over say nothing of the heading
 
 
 class Smoother:
     """The graph of Eqs. 6 and 7 from records, and its newest poses back.
 
-    A landmark is a node (Point2); of the kind "..._summed..." all that two frames saw are one edge between them, as in
-    our graph (landmarks.py): the centroid weighted by information, at the heading that is known then. "..._qr" and
-    "..._once" are settings: the factorisation, and never to linearise again, which ours does not either.
+    A landmark is a node (Point2). "..._qr" is the factorization.
     """
 
     def __init__(self, kind: str, lag_frames: int) -> None:
@@ -33,9 +30,6 @@ class Smoother:
         params = gtsam.ISAM2Params()
         params.setFactorization("QR" if kind.endswith("qr") else "CHOLESKY")
         params.relinearizeSkip = 1 if kind == "isam2" else _RELINEARIZE_SKIP
-        if kind.endswith("once"):
-            params.enableRelinearization = False
-        self._summed = "summed" in kind
         params.findUnusedFactorSlots = True
         self.solver: Any
         if kind == "isam2":
@@ -45,10 +39,8 @@ class Smoother:
         else:
             self.solver = gtsam.IncrementalFixedLagSmoother(lag_frames, params)
         self.frame: int | None = None
-        self.frame_tied = 0
         self.ego = gtsam.Pose2()
         self.seen: dict[int, int] = {}
-        self.tied: tuple[int, dict[int, LandmarkEdge]] | None = None  # of the last frame with landmarks: its pose's key
         self.landmarks: dict[int, int] = {}  # by key, the frame that each node was last seen in
 
     def step(self, m: Measurements) -> list[tuple[gtsam.Pose2, Any]]:
@@ -74,9 +66,7 @@ class Smoother:
             if self.frame is not None and self.seen.get(link.vehicle) == link.from_frame == self.frame:
                 before, key = _vehicle(link.vehicle, link.from_frame), _vehicle(link.vehicle, m.frame_id)
                 factors.add(gtsam.BetweenFactorPose2(before, key, _pose(link.T_from_to), _noise(link.cov)))
-        if self._summed and m.cp:
-            self._add_summed(factors, ego, m)
-        for sight in () if self._summed else m.cp:
+        for sight in m.cp:
             key = landmark_key(sight.kind, sight.landmark)
             factors.add(_landmark_factor(ego, key, sight))
             if key not in self.landmarks:
@@ -95,32 +85,6 @@ class Smoother:
         if self.kind == "batch_fixed_lag":
             return [(pose, None) for pose in poses]
         return [(pose, self.solver.marginalCovariance(key)) for pose, key in zip(poses, keys, strict=True)]
-
-    def _add_summed(self, factors: Any, ego: int, m: Measurements) -> None:
-        """All CP edges to landmarks that the last frame with any saw too, as one edge on where that one's pose is."""
-        now = {landmark_key(sight.kind, sight.landmark): sight for sight in m.cp}
-        if (
-            self.tied is not None
-            and (both := now.keys() & self.tied[1].keys())
-            and m.frame_id - self.frame_tied <= (self.lag_frames)
-        ):
-            there, then = self.tied
-            turn = self.ego.rotation().inverse().compose(self.solver.calculateEstimatePose2(there).rotation())
-            R = turn.matrix()
-            information, moment = np.zeros((2, 2)), np.zeros(2)
-            for key in sorted(both):
-                a, b = now[key], then[key]
-                cov = np.reshape(a.cov, (2, 2)) + R @ np.reshape(b.cov, (2, 2)) @ R.T
-                weight = np.linalg.inv(cov)
-                information += weight
-                moment += weight @ (np.array([a.x_m, a.y_m]) - R @ np.array([b.x_m, b.y_m]))
-            cov3 = np.diag([0.0, 0.0, _FREE_RAD**2])
-            # gtsam has an edge's noise in the axes of the measured pose
-            cov3[:2, :2] = R.T @ np.linalg.inv(information) @ R
-            x, y = np.linalg.solve(information, moment)
-            noise = gtsam.noiseModel.Gaussian.Covariance(cov3)
-            factors.add(gtsam.BetweenFactorPose2(ego, there, gtsam.Pose2(x, y, turn.theta()), noise))
-        self.tied, self.frame_tied = (ego, now), m.frame_id
 
     def between(self) -> None:
         """Nothing to do between frames."""

@@ -3,13 +3,11 @@
     python -m perf system --source demo|kitti:DIR --rate 33 --seconds 120 [--model detector=F.onnx] --output F.json
 
 `birdslam run` starts the real processes; this process is their planner. A recording is played in a loop at `--rate`.
-`--vehicles 0,5,10,15` runs only the optimize process (convoy.py). The results exclude the first seconds, except for
-dropped frames.
+The results exclude the first seconds, except for dropped frames.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,9 +16,8 @@ import msgspec
 import numpy as np
 
 from birdslam.geometry.arrays import Floats
-from birdslam.perf.latency import convoy
 from birdslam.perf.latency.live import Ask, Run, add_run_options, drive
-from birdslam.perf.reporting.arguments import benchmark_parser, numbers
+from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.reporting.figures import Ledger, curve, spread, spread_text
 from birdslam.perf.reporting.machine import Steal
 from birdslam.runtime.configuration import BudgetsConfig
@@ -41,13 +38,9 @@ def run(arguments: list[str]) -> int:
     parser.add_argument("--rate", type=float, default=33.0, help="Hz")
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--load", type=int, default=0, help="number of cores loaded by other processes")
-    parser.add_argument("--vehicles", type=numbers, help="list of vehicle counts; only the optimize process runs")
     parser.add_argument("--planners", type=int, default=0, help="number of additional planners")
     parser.add_argument("--profile", type=Path, metavar="DIR", help="folder for py-spy's flame graphs")
     options = parser.parse_args(arguments)
-    if options.vehicles is not None:
-        _with_vehicles(options)
-        return 0
     ask = Ask(
         source=options.source,
         rate=options.rate,
@@ -67,14 +60,6 @@ def run(arguments: list[str]) -> int:
         if not result.complete:
             raise KeyboardInterrupt
     return 0 if all(row["met"] for row in ledger.content["budgets"]) else 1
-
-
-def _with_vehicles(options: argparse.Namespace) -> None:
-    settings = {"rate": options.rate, "seconds": options.seconds, "load": options.load}
-    with Ledger(options.output, label, vehicles=options.vehicles, **settings) as ledger, busy_cores(options.load):
-        for vehicles in options.vehicles:
-            row = convoy.measure(vehicles, options.rate, options.seconds, WARM_UP_S, tuple(options.set))
-            ledger.add(f"{vehicles} vehicles", convoy.summary(row), **row)
 
 
 def figures(result: Run, warm_up_s: float = 0.0) -> dict[str, Any]:

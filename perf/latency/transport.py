@@ -1,9 +1,9 @@
-"""Pixels and messages between two processes: our ring and bus, plain zenoh, zenoh's shared memory, and a socket.
+"""Pixels and messages between two processes: our ring and bus, and plain zenoh.
 
     python -m perf transport [--seconds 3] [--carriers ring,zenoh] [--output F.json]
 
 Each case has two fresh processes. `ring` is the transport of frames (pixels in shared memory with a checksum, a typed
-FrameRef over zenoh), `bus` that of records (typed and validated at both ends); the alternatives send raw bytes.
+FrameRef over zenoh), `bus` that of records (typed and validated at both ends); `zenoh` sends raw bytes.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from birdslam.perf.reporting.figures import Ledger, curve, spread, spread_text
 from birdslam.perf.reporting.machine import Steal
 from birdslam.runtime.doctor.costs import busy_cores
 
-label = "pixels and messages between processes: our ring and bus, and alternatives"
+label = "pixels and messages between processes: our ring and bus, and plain zenoh"
 
 SIZES_B = {200: "200 B", 4_000: "4 kB", 1_397_250: "1.4 MB"}  # the last: a colour frame of KITTI
 BUS_MAX_B = 60_000  # pixels never use the bus

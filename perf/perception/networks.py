@@ -26,7 +26,6 @@ from birdslam.perception import Detections, Findings, ModelSpec, Network, load_n
 from birdslam.perception.decoding.multitask import MultiTaskDecoder
 from birdslam.perception.manifest import SHIPPED_MULTITASK, SHIPPED_NETWORKS
 from birdslam.perf.errors import PerfError
-from birdslam.perf.perception import labelled_bodies
 from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
 from birdslam.sources.opening import open_recording
@@ -69,10 +68,6 @@ def run(arguments: list[str]) -> None:
             for name, folder in RECORDINGS.items():
                 figures = real(network, options.data / folder, options.models)
                 ledger.add(f"real {name}", _summary(figures), **figures)
-            for name, figures in labelled_bodies.measure(
-                lambda image: _findings(network, image).detections, options.data
-            ).items():
-                ledger.add(f"bodies of {name}", _summary(figures), **figures)
         else:
             print(f"real frames: skipped, {options.data} does not exist (set BIRDSLAM_DATA)")
 

@@ -45,16 +45,14 @@ STEPS = (
     Step("system", "system", "--seconds 120", "--seconds 600", on_source=True),
     Step("system-loaded", "system", "--seconds 60 --load 1", "--seconds 120 --load 1", on_source=True),
     Step("system-planners", "system", "--seconds 10 --planners 4", "--seconds 60 --planners 4", on_source=True),
-    Step("vehicles", "system", "--vehicles 0,5,10,15 --seconds 31", "--vehicles 0,1,3,6,10,15 --seconds 60"),
     Step(
         "optimizer",
         "optimizer",
         "--frames 10000 --vehicles 0,5,10,15 --limit-s 15 --contenders ours,isam2,incremental_fixed_lag_qr",
         "--frames 10000 --limit-s 60",
     ),
-    Step("incremental", "incremental", "--frames 200", "--frames 50,100,200,414"),
+    Step("batch", "optimizer", "--batch 200", "--batch 50,100,200,414"),
     Step("transport", "transport", "--seconds 0.8", "--seconds 10"),
-    Step("ratios", "ratios", "--rounds 1", "--rounds 5"),
 )
 
 
