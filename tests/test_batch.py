@@ -16,10 +16,11 @@ import numpy as np
 import pytest
 
 from birdslam.runtime.batch import drive as driving
+from birdslam.runtime.batch import report
 from birdslam.runtime.batch.drive import DRIVES, DriveResult, Failure, Job, done, failure_file, run_drive
 from birdslam.runtime.batch.drives import Task, find_drives, sweep, tasks
 from birdslam.runtime.batch.local import run_local
-from birdslam.runtime.batch.report import MAX_BARS, write_report
+from birdslam.runtime.batch.report import write_report
 from birdslam.runtime.cli.main import main
 from birdslam.runtime.configuration import ConfigurationError
 
@@ -179,8 +180,9 @@ def result(task: Task, number: int) -> DriveResult:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("count", [3, MAX_BARS + 1])
-def test_the_report_lists_every_drive(tmp_path: Path, count: int) -> None:
+@pytest.mark.parametrize("count", [3, 5])
+def test_the_report_lists_every_drive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, count: int) -> None:
+    monkeypatch.setattr(report, "MAX_BARS", 4)
     drive = kitti(tmp_path / "00", 1)
     (one,) = made([drive])
     todo = [msgspec.structs.replace(one, name=f"<{n}>", settings={"a": n}) for n in range(count)]

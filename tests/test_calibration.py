@@ -181,10 +181,14 @@ def test_a_chessboard_gives_the_lens(boards: Path) -> None:
 def test_a_bad_chessboard_is_named(boards: Path, tmp_path: Path) -> None:
     two = tmp_path / "two"
     two.mkdir()
-    for name in ("0.png", "1.png"):  # where there is no such board each is searched to the end
+    for name in ("0.png", "1.png"):
         (two / name).symlink_to(boards / name)
+    small = tmp_path / "small"  # where there is no such board each is searched to the end
+    small.mkdir()
+    for name in ("0.png", "1.png"):
+        cv2.imwrite(str(small / name), cv2.resize(cv2.imread(str(boards / name)), (160, 120)))
     with pytest.raises(DatasetError, match="was found in 0 of 2 images"):
-        from_chessboard(two, COLUMNS + 1, ROWS + 1, SQUARE_M)
+        from_chessboard(small, COLUMNS + 1, ROWS + 1, SQUARE_M)
     with pytest.raises(DatasetError, match="no such directory"):
         from_chessboard(tmp_path / "nowhere", COLUMNS, ROWS, SQUARE_M)
     with pytest.raises(DatasetError, match="no images"):

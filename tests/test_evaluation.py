@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -64,8 +64,10 @@ def shaken(poses: Transform, seed: int) -> Transform:
 
 
 seeds = st.integers(0, 10_000)
+few = settings(max_examples=10)
 
 
+@few
 @given(seeds)
 def test_the_truth_itself_has_no_error(seed: int) -> None:
     truth = drive(seed)
@@ -74,6 +76,7 @@ def test_the_truth_itself_has_no_error(seed: int) -> None:
     assert evo_errors(truth, truth) == pytest.approx(dict.fromkeys(EVO, 0.0), abs=1e-6)
 
 
+@few
 @given(seeds)
 def test_errors_do_not_depend_on_where_either_begins(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -85,6 +88,7 @@ def test_errors_do_not_depend_on_where_either_begins(seed: int) -> None:
     assert path_length_m(moved) == pytest.approx(path_length_m(estimated))
 
 
+@few
 @given(seeds, st.floats(0.5, 2.0))
 def test_a_scaled_path_has_a_scale_error_and_its_shape_none(seed: int, scale: float) -> None:
     truth = drive(seed)

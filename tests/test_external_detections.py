@@ -36,7 +36,7 @@ from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
 from birdslam.vehicles.track import EgoFrame, TrackingConfig
 from birdslam.vehicles.tracking import Tracker
 
-FRAMES = 10
+FRAMES = 7
 NAMES = ("person", "bicycle", "car", "motorcycle", "bus", "truck", "van", "trailer", "cyclist")
 LENS = Camera(1280, 720, 900.0, 900.0, 640.0, 360.0, 1.4, distortion=(-0.3, 0.1, 0.001, -0.002))
 

@@ -530,7 +530,7 @@ from birdslam.runtime.process.child import give_back_memory
 def heap_kib():
     parts = Path("/proc/self/smaps").read_text().split("[heap]")[1:]
     return sum(int(part.split("Rss:")[1].split()[0]) for part in parts)
-configuration = load(None, {"source.uri": "demo", "source.rate": "max", "source.frames": 200}, [], {})
+configuration = load(None, {"source.uri": "demo", "source.rate": "max", "source.frames": 120}, [], {})
 source = open_source(configuration)
 configuration = complete(configuration, source.camera, source.rate_hz)
 cv2.setNumThreads(configuration.perceive.opencv_threads)
@@ -548,7 +548,7 @@ with Inference(configuration) as inference:
 
 @pytest.mark.processes
 def test_allocations_of_perceive_fit_its_reserve() -> None:
-    """Six seconds of the shipped drive; by what did not fit perceive grew for a quarter of an hour, burst by burst."""
+    """Four seconds of the shipped drive; by what did not fit perceive grew for a quarter of an hour, burst by burst."""
     if platform.libc_ver()[0] != "glibc":
         pytest.skip("these are glibc's settings")
     environment = {**os.environ, **ENVIRONMENT}

@@ -152,6 +152,7 @@ def test_planner_gets_poses_in_the_map(tmp_path_factory: pytest.TempPathFactory,
     assert {"localised"} <= {pose["state"] for pose in recorded}
 
 
+@pytest.mark.slow  # a start more
 def test_everything_is_loaded_before_the_first_frame(tmp_path_factory: pytest.TempPathFactory, road: Path) -> None:
     """A new map is looked up in only when it has places."""
     place = tmp_path_factory.mktemp("e")

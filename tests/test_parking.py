@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from birdslam.world.rendering import materials as m
 from birdslam.world.street.street import Street
 from birdslam.world.street.street_plan import draw_street
 from birdslam.world.traffic.flow import Mover, populate
@@ -77,43 +76,6 @@ def test_lots_have_angled_and_perpendicular_cars(places: list[Place]) -> None:
     assert len(counts) > 20
     assert np.median(counts) >= 4
     assert 0.2 < np.mean(np.array(tilts) < 0.96) < 0.8  # aslant; the others across
-
-
-def test_nothing_is_built_on_a_lot_and_no_side_road_runs_through_it(places: list[Place]) -> None:
-    for street, lots, standing, _ in places:
-        for lot in lots:
-            side = 1 if lot.near_m > 0.0 else -1
-            low, high = sorted((lot.near_m, lot.far_m))
-            for s_m in np.arange(lot.s0_m, lot.s1_m, 4.0):
-                assert not street.in_crossing(float(s_m), 1.0, side)
-            for kind, s_m, d_m in zip(standing.kind, standing.s_m, standing.d_m, strict=True):
-                if kind in (m.BUILDING, m.TREE, m.CRATE):
-                    assert not (lot.s0_m < s_m < lot.s1_m and low < d_m < high)
-
-
-def test_scenery_off_the_lots_is_kept() -> None:
-    lot = Lot(40.0, 60.0, 8.0, 16.0, (), 0.0)
-    standing = Scenery([], [], [], [], [])
-    for kind, s_m, d_m in (
-        (m.BUILDING, 50.0, 12.0), (m.TREE, 50.0, 12.0), (m.POST, 50.0, 8.3), (m.POST, 50.0, 12.0),
-        (m.BUILDING, 50.0, -12.0),
-    ):  # fmt: skip
-        standing.add(kind, s_m, d_m, 0.0, (10.0, 8.0, 6.0) if kind == m.BUILDING else (1.0, 1.0, 3.0))
-    out = cleared(standing, (lot,), np.random.default_rng(0))
-    kept = [(kind, d_m) for kind, d_m in zip(out.kind, out.d_m, strict=True) if kind != m.HEDGE]
-    house = next(d_m for kind, d_m in kept if kind == m.BUILDING and d_m > 0.0)
-    assert house - 4.0 >= lot.far_m
-    assert [row for row in kept if row != (m.BUILDING, house)] == [(m.POST, 8.3), (m.BUILDING, -12.0)]
-
-
-def test_the_same_seed_parks_the_same_cars() -> None:
-    def draw() -> list[tuple[float, float, float]]:
-        rng = np.random.default_rng(7)
-        street = draw_street(rng, 240.0, EGO_S_M, "residential")
-        movers = populate(rng, street, EGO_S_M, EGO_D_M, lots=draw_lots(rng.spawn(1)[0], street, EGO_S_M))
-        return [(v.s_m, v.d_m, v.turn_rad) for v in movers]
-
-    assert draw() == draw()
 
 
 def test_bodies_behind_a_kerb_are_on_the_pavement(places: list[Place]) -> None:

@@ -8,16 +8,12 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from birdslam.geometry.se2 import SE2
 from birdslam.perf.__main__ import main
-from birdslam.perf.latency import optimizer, system, transport
-from birdslam.perf.latency.drive import DriveConfig
+from birdslam.perf.latency import system, transport
 from birdslam.perf.latency.live import Run, Sample
 from birdslam.perf.reporting import all as everything
 from birdslam.perf.reporting import check, report
@@ -25,24 +21,9 @@ from birdslam.perf.reporting.figures import Ledger, curve, spread
 from birdslam.runtime.cli import main as birdslam
 from birdslam.runtime.transport.bus import Message
 from birdslam.runtime.wire import Stage, Trace
-from birdslam.types import Estimate, Status
+from birdslam.types import Estimate
 
 MS = 1_000_000
-
-
-@given(st.lists(st.floats(0.0, 1e6), min_size=1, max_size=300))
-def test_a_spread_is_ordered_and_within_its_series(values: list[float]) -> None:
-    found = spread(values)
-    assert min(values) - 1e-3 <= found["p50"] <= found["p99"] <= found["p999"] <= found["max"] <= max(values) + 1e-3
-    assert found["n"] == len(values)
-    levels, points = zip(*curve(values), strict=True)
-    assert list(levels) == sorted(levels)
-    assert list(points) == sorted(points)
-
-
-def test_empty_series_has_no_result() -> None:
-    assert spread([]) == {"n": 0}
-    assert curve([]) == []
 
 
 def test_ratio_of_two_versions_is_the_median_over_the_rounds() -> None:
@@ -64,25 +45,6 @@ def test_check_fails_for_a_slower_version(monkeypatch: pytest.MonkeyPatch) -> No
     assert main(arguments) == 0
     monkeypatch.setattr(check, "LIMIT", 0.2)
     assert main(arguments) == 1
-
-
-def _cut_short(path: Path) -> None:
-    with Ledger(path, "a benchmark") as ledger:
-        ledger.add("first", "shown", value=np.float64(1.5))
-        raise KeyboardInterrupt
-
-
-def test_interrupted_ledger_keeps_its_rows(tmp_path: Path) -> None:
-    path = tmp_path / "some" / "figures.json"
-    with pytest.raises(KeyboardInterrupt):
-        _cut_short(path)
-    kept = json.loads(path.read_text())
-    assert kept["rows"] == [{"name": "first", "value": 1.5}]
-    assert kept["complete"] is False
-    assert {"cpu", "cores", "kernel", "commit", "versions"} <= kept["machine"].keys()
-    with Ledger(path, "a benchmark"):
-        pass
-    assert json.loads(path.read_text())["complete"] is True
 
 
 def _message(frame: int, slow_ms: int = 0) -> Message:
@@ -137,64 +99,6 @@ def test_budgets_are_those_of_the_configuration() -> None:
     assert len(held) == 7
     broken = {row["budget"] for row in system.figures(_run(11.0))["budgets"] if not row["met"]}
     assert broken == {"perceive_ms"}
-
-
-def test_waiting_time_counts_for_the_node_not_the_hop() -> None:
-    run = _run(40.0)
-    for number in range(100, 110):
-        was = run.messages[number]
-        first, second, last = was.trace.stages
-        arrived_ns, by_ns = second.received_ns, 30 * MS
-        moved = [Stage(s.node, s.received_ns + by_ns, s.done_ns + by_ns, s.sent_ns + by_ns) for s in (second, last)]
-        waited = msgspec.structs.replace(moved[0], arrived_ns=arrived_ns)
-        run.messages[number] = Message(was.record, Trace((first, waited, moved[1])), was.t_received_ns + by_ns)
-    found = system.figures(run)
-    assert found["stages"]["perceive queue"]["n"] == 10
-    assert found["stages"]["capture -> perceive"]["max"] == pytest.approx(1.0)
-    held = {row["budget"]: row for row in found["budgets"]}
-    assert not held["perceive_ms"]["met"]
-    assert {name for name, row in held.items() if not row["met"]} == {"perceive_ms"}
-    assert sum(stage["mean"] for stage in found["stages"].values()) == pytest.approx(found["age_ms"]["mean"], abs=1e-2)
-
-
-def test_a_warm_up_is_left_out() -> None:
-    run = _run(100.0).after(3.0)
-    assert len(run.messages) == 200
-    assert run.messages[0].record.frame_id == 100
-
-
-def test_a_coasted_estimate_has_other_parts_and_they_add_up_too() -> None:
-    """Perceive did not answer in time: its trace leads from capture to optimize. The means still make the whole."""
-    run = _run(100.0)
-    coasted = 0
-    for number in (20, 120, 199):
-        was = run.messages[number]
-        first, _, last = was.trace.stages
-        record = msgspec.structs.replace(was.record, status=(Status.COASTING, Status.PERCEPTION_LATE))
-        run.messages[number] = Message(record, Trace((first, last)), was.t_received_ns)
-        coasted += 1
-    found = system.figures(run)
-    assert found["coasted"] == coasted
-    assert found["stages"]["capture -> optimize"]["n"] == coasted
-    assert found["stages"]["perceive"]["n"] == 300 - coasted
-    assert sum(stage["mean"] for stage in found["stages"].values()) == pytest.approx(found["age_ms"]["mean"], abs=1e-2)
-    assert {row["budget"] for row in found["budgets"]} == {
-        row["budget"] for row in system.figures(_run(1.0))["budgets"]
-    }
-
-
-def test_a_republished_estimate_counts_for_no_stage() -> None:
-    message = _message(5)
-    newer = msgspec.structs.replace(message.record, t_capture_ns=message.record.t_capture_ns + 4 * MS)
-    again = Message(newer, message.trace, message.t_received_ns)
-    assert dict(system.parts(again)) == {"published again": pytest.approx(system.age_of(again))}
-
-
-def test_lateness_is_against_the_frame_that_kept_the_pace_best() -> None:
-    messages = [_message(frame) for frame in range(5)]
-    late = msgspec.structs.replace(messages[3].record, t_capture_ns=messages[3].record.t_capture_ns + 4 * MS)
-    messages[3] = Message(late, messages[3].trace, messages[3].t_received_ns)
-    assert system.lateness(messages, 1e3 / 30.0) == pytest.approx([0.0, 0.0, 0.0, 4.0, 0.0], abs=1e-3)
 
 
 @pytest.mark.slow
@@ -255,15 +159,6 @@ def test_carriers_deliver_every_message_of_a_slow_stream() -> None:
         assert row["sent"] == 10
         assert row["latency_ms"]["n"] + row["dropped"] == 10
         assert row["latency_ms"]["n"] > 0
-
-
-@pytest.mark.processes
-def test_the_optimizer_is_measured(tmp_path: Path) -> None:
-    log = tmp_path / "log"
-    optimizer.write_log(log, DriveConfig(frames=60, vehicles=1), seed=1)
-    row = optimizer.measure("ours", 1, log, 10.0)
-    assert row["frames"] == 60
-    assert len(row["over_frames_us"]) == 50
 
 
 def test_interrupted_suite_keeps_its_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
+from birdslam.outputs import bev_picture
 from birdslam.outputs.bev_picture import Track
 from birdslam.outputs.drive_files import Recorder, ResultsError, claim_directory
 from birdslam.outputs.placed import ROAD_IN_MAP, Place, write_places
@@ -241,7 +242,8 @@ def test_memory_of_a_long_drive_is_bounded(tmp_path: Path) -> None:
     assert len(list((tmp_path / "tracks").iterdir())) == 1500
 
 
-def test_picture_shows_trajectory_and_moving_car(tmp_path: Path) -> None:
+def test_picture_shows_trajectory_and_moving_car(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bev_picture, "DPI", 160)
     recorder = Recorder(tmp_path, CAMERA)
     for k in range(40):
         seen = (

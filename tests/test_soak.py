@@ -11,7 +11,7 @@ import psutil
 import pytest
 
 from birdslam.perf.robustness import soak
-from birdslam.perf.robustness.soak import Ages, Series, Systemd, ages, drift, faults, sample, slope, table
+from birdslam.perf.robustness.soak import Ages, Series, Systemd, ages, drift, faults, sample, table
 from tests.test_bus import until
 
 WELL: dict[str, Any] = {
@@ -36,25 +36,6 @@ def test_constant_series_pass(systemd: Systemd) -> None:
     assert list(faults({"perceive": flat}, WELL, systemd)) == []
     (row,) = [line for line in table({"perceive": flat}, WELL, systemd).splitlines() if line.startswith("| perceive")]
     assert row.endswith("| 0 | 3 |")
-
-
-def test_growth_at_start_is_not_extrapolated(systemd: Systemd) -> None:
-    rng = np.random.default_rng(3)
-    warm = series([*np.linspace(100.0, 100.8, 60), *(100.8 + 0.01 * rng.normal(size=60))], [30] * 120)
-    assert list(faults({"map": warm}, WELL, systemd)) == []
-    slow = series([100.0 + 0.005 * k + 0.01 * noise for k, noise in enumerate(rng.normal(size=120))], [30] * 120)
-    (said,) = faults({"map": slow}, WELL, systemd)  # half a percent in ten minutes
-    assert said.startswith("map would grow by 2")
-    assert said.endswith("in 8 hours")
-
-
-def test_one_step_is_not_growth_and_many_are(systemd: Systemd) -> None:
-    one = series([210.9] * 164 + [211.9] * 64, [30] * 228)  # 1 MiB at once in 19 minutes: a table that doubles
-    assert list(faults({"supervisor": one}, WELL, systemd)) == []
-    gain, sigma = one.in_a_shift()
-    assert gain == pytest.approx(sigma, rel=0.05)
-    many = series([210.0 + 0.1 * (k // 6) for k in range(120)], [30] * 120)  # 2 MiB in ten minutes, by steps of .1
-    assert any("perceive would grow by" in said for said in faults({"perceive": many}, WELL, systemd))
 
 
 def test_sigma_of_drift_is_consistent() -> None:
@@ -93,18 +74,6 @@ def test_growing_age_is_named() -> None:
     said, bad = ages(Ages(t_s, [20.0 + 0.05 * k for k in range(400)]))
     assert bad == ["the median age grew from 22.5 to 37.5 ms"]
     assert "p50 +6000.0 +- 0.0 ms an hour" in said  # 0.05 ms in 0.03 s
-
-
-def test_sigma_of_slope_is_consistent() -> None:
-    t_s, rng = np.arange(0.0, 3600.0, 5.0), np.random.default_rng(5)
-    found = []
-    for _ in range(300):
-        swings = np.repeat(rng.normal(size=24), 30)  # what a process holds stays for minutes
-        found.append(slope(t_s, 100.0 + 0.5 * t_s / 3600.0 + swings))
-    gains, sigmas = np.transpose(found)
-    assert gains.mean() == pytest.approx(0.5, abs=3.0 * gains.std() / np.sqrt(300))
-    assert np.sqrt(np.mean(sigmas**2)) == pytest.approx(gains.std(), rel=0.2)
-    assert np.isnan(slope([1.0], [2.0])).all()
 
 
 def test_restarted_nodes_are_named(systemd: Systemd) -> None:

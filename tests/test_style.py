@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import io
 import re
 import subprocess
@@ -39,19 +40,29 @@ NAMES = {
 }
 
 
+def tokens(path: Path) -> Iterator[tokenize.TokenInfo]:
+    with io.BytesIO(path.read_bytes()) as file:
+        yield from tokenize.tokenize(file.readline)
+
+
 def texts(path: Path) -> Iterator[tuple[int, str]]:
     """Line number and text of every comment and string of a module."""
-    with io.BytesIO(path.read_bytes()) as file:
-        for token in tokenize.tokenize(file.readline):
-            if token.type in (tokenize.COMMENT, tokenize.STRING):
-                yield from enumerate(token.string.splitlines(), token.start[0])
+    for token in tokens(path):
+        if token.type in (tokenize.COMMENT, tokenize.STRING):
+            yield from enumerate(token.string.splitlines(), token.start[0])
 
 
 def identifiers(path: Path) -> Iterator[tuple[int, str]]:
-    with io.BytesIO(path.read_bytes()) as file:
-        for token in tokenize.tokenize(file.readline):
-            if token.type == tokenize.NAME:
-                yield token.start[0], token.string
+    """The names that a module binds, by line; a name that is only used is bound somewhere else."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            yield node.lineno, node.id
+        elif isinstance(node, ast.FunctionDef | ast.ClassDef):
+            yield node.lineno, node.name
+        elif isinstance(node, ast.arg):
+            yield node.lineno, node.arg
+        elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
+            yield node.lineno, node.attr
 
 
 def findings(path: Path, lines: Iterator[tuple[int, str]], patterns: dict[str, str]) -> list[str]:
