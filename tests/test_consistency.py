@@ -19,9 +19,9 @@ from birdslam.graph.weights import WeightsConfig
 from birdslam.odometry.road.fit import RoadFit
 from birdslam.odometry.road.kalman_filter import RoadFilter
 from birdslam.odometry.scale_config import RoadScaleConfig
-from birdslam.perf.latency.batch_se2 import Solution, ego_key, solve, vehicle_key
 from birdslam.perf.latency.drive import Drive, DriveConfig, drive
 from birdslam.types import EgoEdge, Estimate, Measurements, VehicleEdge
+from tests.batch_se2 import Solution, ego_key, solve, vehicle_key
 from tests.recordings import KITTI as CAMERA
 
 ALL_EDGES = WeightsConfig(leave_out=())

@@ -12,9 +12,9 @@ from msgspec.structs import replace
 from birdslam.graph.g2o import g2o_lines
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.weights import WeightsConfig
-from birdslam.perf.latency.batch_se2 import ego_key, solve
 from birdslam.perf.latency.drive import DriveConfig, drive
 from birdslam.types import Measurements
+from tests.batch_se2 import ego_key, solve
 
 CONFIG = DriveConfig(frames=30, rate_hz=10.0, vehicles=2, landmarks=6, traffic="convoy")
 LOG = drive(CONFIG, 3).measurements

@@ -18,10 +18,10 @@ from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.graph.window import Window
-from birdslam.perf.latency.batch_se2 import ego_key, solve, vehicle_key
 from birdslam.perf.latency.drive import Drive, DriveConfig, drive
 from birdslam.slam import SlamConfig
 from birdslam.types import Estimate, LandmarkEdge, Measurements, Status
+from tests.batch_se2 import ego_key, solve, vehicle_key
 
 # Sec. 3.3.2 of the paper
 LAMBDA_CP, LAMBDA_CV = 10_000.0, (10.0, 1_000.0)

@@ -1,4 +1,4 @@
-"""Consistency of the scale of one video at other sizes, rates, compressions, with obstructions, and later starts.
+"""Consistency of the scale of one video at other sizes and rates, with noise, and with later starts.
 
     python -m perf films [FILM ...] [--part PART ...] [--seconds S] [--begin-at S ...] [--output FILE.json] [--data DIR]
                          [--networks] [--model ROLE=PATH ...]
@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,7 +44,7 @@ from birdslam.sources.recording import DatasetError, Recording
 from birdslam.trajectory import as_poses, inverse
 from birdslam.types import NS_PER_S, Frame
 
-label = "consistency of the scale of one video at other sizes, rates, compressions, and with obstructions"
+label = "consistency of the scale of one video at other sizes and rates, and with later starts"
 
 Floats = NDArray[np.float64]
 Seen = tuple[Floats, NDArray[np.bool_] | None]  # boxes (N, 4) and the road (H, W) from networks
@@ -143,20 +142,18 @@ def drive(
     camera = variant.camera(recording.camera)
     odometry, undistort = Odometry(camera), Undistorter(camera)
     course, times_ns = Course(), list[int]()
-    with tempfile.TemporaryDirectory() as folder:
-        images = variant.images(_within(recording, span_s), Path(folder))
-        for k, (t_ns, raw) in enumerate(images):
-            times_ns.append(t_ns)
-            boxes_px, road = _at_size(looks(t_ns), recording.camera, camera)
-            motion = odometry.estimate(odometry.track(undistort(raw)), k, t_ns, boxes_px, road)
-            begin_ns = times_ns[k if motion is None else motion.from_frame]
-            if motion is None or begin_ns == t_ns:
-                continue
-            begin_s, end_s = begin_ns / NS_PER_S, t_ns / NS_PER_S
-            mps = float(np.linalg.norm(motion.t_prev_curr_m)) / (end_s - begin_s)
-            at_s = end_s - times_ns[0] / NS_PER_S
-            true, sigma_rel = true_mps(begin_s, end_s), math.hypot(motion.scale_sigma_rel, camera.scale_sigma_rel)
-            course.add(at_s, end_s - begin_s, mps, true, is_valid(motion), sigma_rel, motion.standstill)
+    for k, (t_ns, raw) in enumerate(variant.images(_within(recording, span_s))):
+        times_ns.append(t_ns)
+        boxes_px, road = _at_size(looks(t_ns), recording.camera, camera)
+        motion = odometry.estimate(odometry.track(undistort(raw)), k, t_ns, boxes_px, road)
+        begin_ns = times_ns[k if motion is None else motion.from_frame]
+        if motion is None or begin_ns == t_ns:
+            continue
+        begin_s, end_s = begin_ns / NS_PER_S, t_ns / NS_PER_S
+        mps = float(np.linalg.norm(motion.t_prev_curr_m)) / (end_s - begin_s)
+        at_s = end_s - times_ns[0] / NS_PER_S
+        true, sigma_rel = true_mps(begin_s, end_s), math.hypot(motion.scale_sigma_rel, camera.scale_sigma_rel)
+        course.add(at_s, end_s - begin_s, mps, true, is_valid(motion), sigma_rel, motion.standstill)
     return course
 
 

@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import json
-import os
-import shutil
-import signal
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterable, Iterator
@@ -26,7 +21,6 @@ from birdslam.runtime.client import Planner
 from birdslam.runtime.fields import is_key
 from birdslam.runtime.topology import MAP, NODES
 from birdslam.runtime.transport.bus import Message
-from birdslam.sources.recording import Recording
 from birdslam.types import Status
 
 START_S, END_S = 90.0, 120.0  # max. times of start and end; at the end results are written
@@ -44,16 +38,14 @@ class Ask(msgspec.Struct, frozen=True, kw_only=True):
     models: tuple[str, ...] = ()  # ROLE=PATH
     settings: tuple[str, ...] = ()  # KEY=VALUE
     config: str = ""  # a file
-    loop: bool = True
     planners: int = 0  # number of additional planners
-    profile: Path | None = None  # folder for py-spy's traces
 
     def command(self, place: Path) -> list[str]:
         """The command line of `birdslam`, with all its files under `place`."""
         settings = [
             f"runtime.runtime_dir={place / 'rt'}",
             f"source.frames={max(1, round(self.rate * self.seconds))}",
-            f"source.loop={str(self.loop).lower()}",
+            "source.loop=true",
             *self.settings,
         ]
         return [
@@ -62,15 +54,6 @@ class Ask(msgspec.Struct, frozen=True, kw_only=True):
             *(part for model in self.models for part in ("--model", model)),
             *setting_options(settings),
         ]
-
-
-def once(options: argparse.Namespace, source: str, recording: Recording, rate: float) -> Ask:
-    """A recording played once at a rate, with the models and settings of a command line (`add_run_options`)."""
-    models, settings = tuple(options.model), tuple(options.set)
-    seconds = len(recording) / rate
-    return Ask(
-        source=source, rate=rate, seconds=seconds, models=models, settings=settings, config=options.config, loop=False
-    )
 
 
 @dataclass
@@ -116,7 +99,7 @@ def drive(ask: Ask) -> Iterator[Run]:
         with log.open("wb") as output:
             process = subprocess.Popen(ask.command(run.place), stdout=output, stderr=output, start_new_session=True)
         try:
-            with _planners(ask.planners, run.place / "rt"), _profiled(ask.profile, process):
+            with _planners(ask.planners, run.place / "rt"):
                 with contextlib.suppress(KeyboardInterrupt):
                     run.complete = _receive(run, process)
                 _finish(process, run.complete)
@@ -185,52 +168,15 @@ def _planners(count: int, runtime_dir: Path) -> Iterator[None]:
             other.wait()
 
 
-@contextlib.contextmanager
-def _profiled(folder: Path | None, process: subprocess.Popen[bytes]) -> Iterator[None]:
-    """Records py-spy's flame graph of each process from start to end: FOLDER/NODE.svg."""
-    if folder is None:
-        yield
-        return
-    tool = shutil.which("py-spy", path=os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")]))
-    if tool is None:
-        raise PerfError("--profile needs py-spy: pip install py-spy")
-    folder.mkdir(parents=True, exist_ok=True)
-    until_s = time.monotonic() + START_S
-    while (
-        process.poll() is None
-        and not set(NODES) <= set(processes_of(process.pid, NODES))
-        and time.monotonic() < until_s
-    ):
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(0.05)
-    spies = []
-    for name, watched in processes_of(process.pid, NODES).items():
-        command = [tool, "record", "--native", "--threads", "--rate", "25", "--format", "flamegraph"]
-        command += ["--output", str(folder / f"{name.replace(' ', '_')}.svg"), "--pid", str(watched.pid)]
-        spies.append(subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE))
-    try:
-        yield
-    finally:
-        for spy in spies:
-            if spy.poll() is None:
-                spy.send_signal(signal.SIGINT)  # py-spy writes its file
-            _, errors = spy.communicate()
-            if spy.returncode:
-                print(f"py-spy: {errors.decode(errors='replace').strip()}", file=sys.stderr)
-
-
 def setting_options(settings: Iterable[str]) -> list[str]:
     """The options of `birdslam run` for KEY=VALUE of any field, a configuration key or a constant."""
     return [part for text in settings for part in ("--set" if is_key(text.partition("=")[0]) else "--constant", text)]
 
 
-def add_run_options(add: Any, many: bool = False) -> None:
-    """Adds the options of an Ask to a parser with its add_argument `add`. `many`: a list of sources."""
+def add_run_options(add: Any) -> None:
+    """Adds the options of an Ask to a parser with its add_argument `add`."""
     sources = "demo (the default: the shipped drive), kitti:DIR or video:FILE"
-    if many:
-        add("--source", action="append", default=[], metavar="URI", help=sources)
-    else:
-        add("--source", default="demo", metavar="URI", help=sources)
+    add("--source", default="demo", metavar="URI", help=sources)
     add("--config", default="", metavar="CONFIG.toml", help="configuration file")
     add("--model", action="append", default=[], metavar="ROLE=PATH")
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="any field of the configuration")

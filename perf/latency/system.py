@@ -9,7 +9,6 @@ The results exclude the first seconds, except for dropped frames.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -39,7 +38,6 @@ def run(arguments: list[str]) -> int:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--load", type=int, default=0, help="number of cores loaded by other processes")
     parser.add_argument("--planners", type=int, default=0, help="number of additional planners")
-    parser.add_argument("--profile", type=Path, metavar="DIR", help="folder for py-spy's flame graphs")
     options = parser.parse_args(arguments)
     ask = Ask(
         source=options.source,
@@ -49,7 +47,6 @@ def run(arguments: list[str]) -> int:
         settings=tuple(options.set),
         config=options.config,
         planners=options.planners,
-        profile=options.profile,
     )
     settings = {**msgspec.to_builtins(ask, enc_hook=str), "seconds": options.seconds, "load": options.load}
     with Ledger(options.output, label, **settings) as ledger:

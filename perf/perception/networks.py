@@ -29,7 +29,7 @@ from birdslam.perf.errors import PerfError
 from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
 from birdslam.sources.opening import open_recording
-from birdslam.world.training.grading import MIN_SIDE_ASPECT, Grades, box_ious, extents, overlap
+from birdslam.world.training.grading import Grades, box_ious, overlap
 
 label = "the shipped network on held-out worlds, and on real frames with LiDAR and two other networks"
 
@@ -94,7 +94,6 @@ def real(network: Network, folder: Path, models: Path) -> dict[str, float]:
     T_cam_cam0 = np.linalg.inv(recording.T_cam0_cam())
     road, lane, shares = np.zeros(2, dtype=np.int64), np.zeros(2, dtype=np.int64), []
     agreed = np.zeros(4, dtype=np.int64)  # theirs found, theirs, ours confirmed, ours
-    sizes: list[Floats] = []  # of ours over theirs, see `extents`
     depths: list[Floats] = []  # (N, 3): estimated, LiDAR's, on the road
     for number, image in _images(recording.frames()):
         found = _findings(network, image)
@@ -113,7 +112,6 @@ def real(network: Network, folder: Path, models: Path) -> dict[str, float]:
             # Includes images in which one of the networks detects nothing
             if found.detections is not None and theirs is not None and theirs.detections is not None:
                 agreed += _agreement(found.detections, theirs.detections)
-                sizes += _sizes(found.detections, theirs.detections, image.shape[1])
     figures: dict[str, float] = {"frames": len(recording)}
     if depths:
         figures |= _depth_figures(np.vstack(depths))
@@ -127,15 +125,6 @@ def real(network: Network, folder: Path, models: Path) -> dict[str, float]:
             "vehicle_precision": float(agreed[2] / max(agreed[3], 1)),
             "vehicles": int(agreed[1]),
         }
-        widths, heights, aspects = np.array(sizes).reshape(-1, 3).T
-        ratios_of = {
-            "box_width_ratio": widths,
-            "box_height_ratio": heights,
-            "long_box_width_ratio": widths[aspects >= MIN_SIDE_ASPECT],
-        }
-        for name, ratios in ratios_of.items():
-            if len(ratios):
-                figures[name] = float(np.median(ratios))
     return figures
 
 
@@ -201,19 +190,6 @@ def _agreement(ours: Detections, theirs: Detections) -> Ints:
             np.count_nonzero(tall_ours),
         ]
     )
-
-
-def _sizes(ours: Detections, theirs: Detections, width_px: int) -> list[Floats]:
-    """Ratio of our box to theirs for each untruncated vehicle above the thresholds that both detect."""
-    ours, theirs = ours.only(VEHICLES), theirs.only(VEHICLES)
-    out = []
-    for box, score in zip(theirs.boxes_px, theirs.scores, strict=True):
-        tall = box[3] - box[1] > MIN_HEIGHT_PX
-        whole = box[0] > BORDER_PX and box[2] < width_px - BORDER_PX
-        shared = box_ious(box[None], ours.boxes_px)[0]
-        if score > MIN_SCORE and tall and whole and shared.max(initial=0.0) >= SAME_IOU:
-            out.append(extents(ours.boxes_px[np.argmax(shared)], box))
-    return out
 
 
 def _summary(figures: dict[str, float]) -> str:
