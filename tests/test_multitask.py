@@ -465,21 +465,6 @@ needs_torch = pytest.mark.skipif(importlib.util.find_spec("torch") is None, reas
 
 
 @needs_torch
-def test_axis_concentration_is_limited() -> None:
-    import torch
-
-    from birdslam.world.training.losses import von_mises
-
-    angles, costs = torch.tensor([0.3, 0.3]), {}
-    for certain in (0.0, 50.0, 200.0, 1000.0):
-        axis = certain * torch.tensor([[1.0, 0.0], [math.cos(0.6), math.sin(0.6)]])
-        costs[certain] = von_mises(axis, angles, 200.0)
-    assert torch.all(costs[0.0] > costs[200.0][1])
-    assert costs[50.0][1] > costs[200.0][1]
-    torch.testing.assert_close(costs[1000.0], costs[200.0])
-
-
-@needs_torch
 def test_perfect_output_has_the_least_loss() -> None:
     import torch
 
@@ -509,85 +494,6 @@ def test_training_steps_reduce_the_loss() -> None:
     trainer = Trainer(TrainerConfig(warm_up_steps=5), half=False)
     costs = [trainer.train_step(as_tensors(next(batches)), 0.0, step, 2e-3)["total"] for step in range(30)]
     assert np.mean(costs[-5:]) < 0.6 * np.mean(costs[:5])
-
-
-@needs_torch
-def test_context_block_starts_as_identity() -> None:
-    import torch
-
-    from birdslam.world.training.network import NetworkConfig
-    from birdslam.world.training.trainer import Trainer, TrainerConfig
-
-    torch.manual_seed(5)
-    before = Trainer(TrainerConfig(network=NetworkConfig(context=0)), half=False)
-    after = Trainer(TrainerConfig(), half=False)
-    after.begin(before.state())
-    image = torch.rand(1, 3, 64, 128).numpy() * 2.0 - 1.0
-    for name, answer in before.raw_outputs(image).items():
-        np.testing.assert_allclose(after.raw_outputs(image)[name], answer, rtol=1.3e-6, atol=1e-5)
-    # Pixels outside of a cell's receptive field matter after training of the new blocks
-    torch.nn.init.ones_(after.average.module.context[0].norm.weight)
-    assert not np.array_equal(after.raw_outputs(image)["depth"], before.raw_outputs(image)["depth"])
-    with pytest.raises(ValueError, match="context"):
-        before.begin(after.state())
-
-
-@needs_torch
-def test_fine_block_starts_as_identity() -> None:
-    import torch
-
-    from birdslam.world.training.trainer import Trainer, TrainerConfig
-
-    torch.manual_seed(6)
-    coarse, trainer = Trainer(TrainerConfig(), half=False), Trainer(TrainerConfig(), half=False)
-    state = coarse.state()
-    for name in ("network", "average"):
-        state[name] = {key: value for key, value in state[name].items() if "fine." not in key}
-    trainer.begin(state)
-    image = torch.rand(1, 3, 64, 128).numpy() * 2.0 - 1.0
-    for name, answer in coarse.raw_outputs(image).items():
-        np.testing.assert_allclose(trainer.raw_outputs(image)[name], answer, rtol=1.3e-6, atol=1e-5)
-    torch.nn.init.ones_(trainer.average.module.fine.say.weight)
-    for name, sharpened in {"segmentation": True, "depth": True, "heat": False, "body": False}.items():
-        assert np.array_equal(trainer.raw_outputs(image)[name], coarse.raw_outputs(image)[name]) != sharpened
-
-
-@needs_torch
-def test_training_starts_with_mean_weights() -> None:
-    import torch
-
-    from birdslam.world.training.network import NetworkConfig
-    from birdslam.world.training.trainer import Trainer, TrainerConfig
-
-    torch.manual_seed(7)
-    first, second, trainer = (Trainer(TrainerConfig(), half=False) for _ in range(3))
-    trainer.begin(first.state(), second.state())
-    for network in ("network", "average"):
-        for name, mean in trainer.state()[network].items():
-            one, other = first.state()[network][name], second.state()[network][name]
-            torch.testing.assert_close(mean, 0.5 * (one + other) if mean.is_floating_point() else other)
-    narrow = Trainer(TrainerConfig(network=NetworkConfig(context=0)), half=False)
-    with pytest.raises(ValueError, match="different networks"):
-        trainer.begin(first.state(), narrow.state())
-
-
-@needs_torch
-def test_nearer_depth_at_an_outline_has_less_loss() -> None:
-    import torch
-
-    from birdslam.world.training.losses import Batch, LossConfig, depth_loss
-
-    near_m, far_m, share_near = 5.0, 20.0, 0.4
-    truth = torch.full((1, 10, 10), far_m).log()
-    truth[0, : int(10 * share_near)] = math.log(near_m)
-    batch = Batch(torch.zeros(0), torch.zeros(0), truth, torch.zeros(1, 10, 10, dtype=torch.bool), torch.zeros(0))
-
-    def cost(said_m: float, relative: float) -> float:
-        said = torch.full((1, 10, 10), said_m).log()
-        return float(depth_loss(said, batch, LossConfig(relative=relative, shape=0.0))["depth"])
-
-    assert cost(near_m, 1.0) < cost(far_m, 1.0)
-    assert cost(near_m, 0.0) > cost(far_m, 0.0)
 
 
 @pytest.mark.slow
