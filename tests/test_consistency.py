@@ -203,16 +203,16 @@ def assert_graph_is_honest(model: str, world: DriveConfig, seeds: int) -> None:
     ],
 )
 def test_covariances_are_honest(model: str, outliers: float) -> None:
-    """The mean NEES of 60 seeded drives, also with outliers in."""
+    """The mean NEES of 40 seeded drives, also with outliers in."""
     world = DriveConfig(frames=40, vehicles=2, landmarks=8, lane_points=0, outliers=outliers)
-    assert_graph_is_honest(model, world, seeds=60)
+    assert_graph_is_honest(model, world, seeds=40)
 
 
 def test_errors_that_last_are_not_averaged_away() -> None:
     """A graph that takes each edge's error for its own is too sure of vehicles by far; by default it is honest."""
     share = GraphConfig().lasting_share
     world = DriveConfig(frames=40, vehicles=2, landmarks=8, lane_points=0, lasting_share=share)
-    assert_graph_is_honest("constant velocity", world, seeds=60)
+    assert_graph_is_honest("constant velocity", world, seeds=40)
     independent = GraphConfig(lasting_share=0.0)
     drawn = replace(world, traffic="drawn")
     found = [nees(drive(drawn, seed), independent, WeightsConfig()) for seed in range(15)]

@@ -13,7 +13,7 @@ from birdslam.perception.manifest_file import read_manifest, shipped_manifests
 from tests import fuzz
 
 ROOT = Path(__file__).resolve().parent.parent
-CASES, SEED = 10_000, 6
+CASES, SEED = 5_000, 6
 YAML_OF_DATA = {"SafeLoader", "YAMLError", "load_all"}  # other loaders run code
 RUNS_CODE = {"eval", "exec", "compile", "__import__"}
 READS_CODE = {"pickle", "marshal", "shelve", "dill", "joblib", "runpy", "imp", "code"}
@@ -28,7 +28,7 @@ def test_every_target_holds() -> None:
 
 def test_the_same_seed_gives_the_same_cases() -> None:
     first, again, other = (
-        [(count.name, count.let_in) for count in fuzz.run(2_000, seed)] for seed in (SEED, SEED, SEED + 1)
+        [(count.name, count.let_in) for count in fuzz.run(500, seed)] for seed in (SEED, SEED, SEED + 1)
     )
     assert first == again
     assert first != other

@@ -445,8 +445,8 @@ def with_common_error(world: Drive, rng: np.random.Generator) -> Drive:
 def test_landmarks_never_make_the_ego_worse_than_cc_alone(common_error: bool) -> None:
     rng = np.random.default_rng(0)
     with_cp, without = [], []
-    for seed in range(12):
-        world = drive(DriveConfig(frames=200, vehicles=0, sigma_cc_m=0.02, outliers=0.05), seed)
+    for seed in range(10):
+        world = drive(DriveConfig(frames=100, vehicles=0, sigma_cc_m=0.02, outliers=0.05), seed)
         world = with_common_error(world, rng) if common_error else world
         with_cp.append(ego_ate(world, WeightsConfig()))
         without.append(ego_ate(world, WeightsConfig(leave_out=("cp",))))

@@ -21,7 +21,7 @@ from birdslam.perf.robustness.faulty_vehicle import RATE_HZ
 from birdslam.perf.robustness.judge import Judge
 from birdslam.types import Estimate, Frame
 
-FRAMES, SETTLED = 75, 4
+FRAMES, SETTLED = 60, 4
 
 
 @pytest.fixture(scope="module")

@@ -98,9 +98,9 @@ def test_a_kilometre_with_lines_is_below_two_megabytes(mapped: bytes) -> None:
 
 
 def test_a_keyframe_without_lines_gets_them_from_a_later_drive() -> None:
-    place_map = driven(PlaceMap(MapCamera.of(CAMERA)), range(40), with_lines=False)
+    place_map = driven(PlaceMap(MapCamera.of(CAMERA)), range(32), with_lines=False)
     assert not place_map.lines()
-    driven(place_map, range(40), with_lines=True, seed=3)
+    driven(place_map, range(32), with_lines=True, seed=3)
     assert {line.line for line in place_map.lines()} == set(LINES)
     assert np.abs(aside_m(place_map, 3) - LINES[3][0]).max() < 0.3
 
