@@ -17,6 +17,7 @@ import numpy as np
 from birdslam.geometry.se2 import SE2
 from birdslam.perf.errors import PerfError
 from birdslam.types import Estimate, VehicleEstimate
+from tests.records import new_estimate
 
 label = "a listener of ROS 2: messages lost, and their age"
 PEER = "tests.ros_peer"
@@ -55,7 +56,12 @@ def estimate(frame: int, vehicles: int) -> Estimate:
         )
         for k in range(vehicles)
     )  # fmt: skip
-    return Estimate(
-        epoch=0, frame_id=frame, t_source_ns=now_ns, t_capture_ns=time.monotonic_ns(), t_utc_ns=now_ns,
-        T_world_ego=SE2(0.1 * frame, 0.0, 0.0), cov=COV, valid=True, vehicles=users,
-    )  # fmt: skip
+    return new_estimate(
+        frame_id=frame,
+        t_source_ns=now_ns,
+        t_capture_ns=time.monotonic_ns(),
+        t_utc_ns=now_ns,
+        T_world_ego=SE2(0.1 * frame, 0.0, 0.0),
+        cov=COV,
+        vehicles=users,
+    )

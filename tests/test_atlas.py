@@ -20,6 +20,7 @@ from birdslam.lanes.amodal.atlas import Atlas, AtlasConfig
 from birdslam.perf.latency.drive import DriveConfig, drive
 from birdslam.queries import MapSnapshot, Trajectory
 from birdslam.types import Estimate, MapUpdate, VehicleEstimate
+from tests.records import new_vehicle
 
 SMALL = AtlasConfig(key_poses=32, octaves=4, vehicles=3, vehicle_poses=8, map_cells=50, map_octaves=3)
 
@@ -31,15 +32,7 @@ def at(frame: int, pose: SE2, *vehicles: VehicleEstimate, epoch: int = 0, valid:
 
 
 def car(vehicle: int, pose: SE2, age_ns: int = 0) -> VehicleEstimate:
-    return VehicleEstimate(
-        vehicle=vehicle,
-        T_world_vehicle=pose,
-        cov=(0.0,) * 9,
-        velocity_mps=(0.0, 0.0),
-        velocity_cov=(0.0,) * 4,
-        age_ns=age_ns,
-        frames=1,
-    )
+    return new_vehicle(vehicle=vehicle, T_world_vehicle=pose, age_ns=age_ns)
 
 
 def test_the_atlas_returns_the_estimates() -> None:

@@ -17,6 +17,7 @@ from birdslam.perf.latency import optimizer
 from birdslam.perf.latency.drive import Drive, DriveConfig, drive
 from birdslam.types import EgoEdge, Estimate, Measurements, VehicleEdge
 from tests.recordings import KITTI as CAMERA
+from tests.records import new_estimate
 
 QUIET = DriveConfig(frames=40, rate_hz=10.0, vehicles=3, landmarks=8, lane_points=0, noise=0.0)
 HEIGHT_M = 1.5
@@ -184,16 +185,7 @@ def test_a_new_epoch_goes_on_where_the_last_one_ended() -> None:
     cov = (0.0,) * 9
 
     def estimate(frame: int, epoch: int, pose: SE2) -> Estimate:
-        return Estimate(
-            epoch=epoch,
-            frame_id=frame,
-            t_source_ns=0,
-            t_capture_ns=0,
-            t_utc_ns=0,
-            T_world_ego=pose,
-            cov=cov,
-            valid=True,
-        )
+        return new_estimate(epoch=epoch, frame_id=frame, T_world_ego=pose, cov=cov)
 
     for frame, epoch, x_m in ((0, 0, 0.0), (1, 0, 2.0), (2, 1, 0.0), (3, 1, 1.5)):
         live.add(estimate(frame, epoch, SE2(x_m)))

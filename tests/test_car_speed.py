@@ -21,6 +21,7 @@ from birdslam.odometry.scale_config import RoadScaleConfig
 from birdslam.odometry.speed.readings import CarSpeedConfig, SpeedReadings
 from birdslam.odometry.speed.scale import SpeedScale
 from birdslam.types import INVALIDATING, NS_PER_S, EgoEdge, Measurements, SpeedReading, SpeedSource, Status
+from tests.records import new_measurements
 from tests.test_odometry import CAMERA, NO_BOXES, path_m, render, street
 
 Speed = Callable[[float], float]
@@ -356,11 +357,13 @@ def test_guessed_turn_is_used_briefly_without_new_epoch() -> None:
     def moved(frame: int) -> Measurements:
         by_car = 5 <= frame < 15
         edge = EgoEdge(from_frame=frame - 1, to_frame=frame, T_from_to=SE2(1.0, 0.0, 0.0), cov=(0.0,) * 9)
-        return Measurements(
-            frame_id=frame, t_source_ns=frame * NS_PER_S // 10, t_capture_ns=0, t_utc_ns=0, cc=edge,
+        return new_measurements(
+            frame_id=frame,
+            t_source_ns=frame * NS_PER_S // 10,
+            cc=edge,
             status=(Status.ODOMETRY_COASTING,) if by_car else (),
             speed_sources=(SpeedSource.CAR,) if by_car else (SpeedSource.ROAD,),
-        )  # fmt: skip
+        )
 
     judged = [gate.admit(moved(frame)) for frame in range(1, 24)]
     assert [m.frame_id for m in judged if Status.MOTION_IMPLAUSIBLE in m.status] == list(range(10, 15))

@@ -17,6 +17,7 @@ from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.perf.latency.drive import DriveConfig, drive
 from birdslam.types import Measurements, Status
+from tests.records import new_measurements
 
 SETTINGS = {
     "measured": (GraphConfig(), WeightsConfig()),
@@ -36,12 +37,8 @@ def worn(log: list[Measurements], break_at: int, blind_at: int) -> list[Measurem
     log = list(log)
     log[break_at % len(log)] = replace(log[break_at % len(log)], cc=None)
     blind = log[blind_at % len(log)]
-    log[blind_at % len(log)] = Measurements(
-        frame_id=blind.frame_id,
-        t_source_ns=blind.t_source_ns,
-        t_capture_ns=0,
-        t_utc_ns=0,
-        status=(Status.FRAME_UNREADABLE,),
+    log[blind_at % len(log)] = new_measurements(
+        frame_id=blind.frame_id, t_source_ns=blind.t_source_ns, status=(Status.FRAME_UNREADABLE,)
     )
     return log
 

@@ -20,7 +20,8 @@ from birdslam.runtime.supervision.final_results import rows as final_rows
 from birdslam.sources.opening import open_recording
 from birdslam.sources.shipped_drive import DemoRecording
 from birdslam.trajectory import as_poses, inverse, split_pose
-from birdslam.types import IN_SIGHT_NS, Estimate, Moves, VehicleEstimate
+from birdslam.types import IN_SIGHT_NS, Estimate, Moves
+from tests.records import new_estimate, new_vehicle
 
 FRAMES = range(0, 90, 3)
 COV = (0.0,) * 9
@@ -42,19 +43,13 @@ def truthful(demo: DemoRecording) -> list[Estimate]:
         # The world that the recorder's constant mount makes of the camera's poses (trajectory.py)
         ego, attitude = split_pose(T_world_first @ poses[k] @ T_cam_ego)
         vehicles = tuple(
-            VehicleEstimate(
-                vehicle=body.body, T_world_vehicle=ego @ body.T_ego_body, cov=COV, velocity_mps=(0.0, 0.0),
-                velocity_cov=(0.0,) * 4, age_ns=0, frames=1, length_m=body.length_m, width_m=body.width_m,
+            new_vehicle(
+                vehicle=body.body, T_world_vehicle=ego @ body.T_ego_body, length_m=body.length_m, width_m=body.width_m
             )
             for body in demo.truth_bodies(k)
             if body.label in VEHICLES
-        )  # fmt: skip
-        out.append(
-            Estimate(
-                epoch=0, frame_id=k, t_source_ns=0, t_capture_ns=0, t_utc_ns=0, T_world_ego=ego, cov=COV, valid=True,
-                vehicles=vehicles, attitude=attitude,
-            )
-        )  # fmt: skip
+        )
+        out.append(new_estimate(frame_id=k, T_world_ego=ego, vehicles=vehicles, attitude=attitude))
     return out
 
 
@@ -180,21 +175,18 @@ def test_movers_are_evaluated_at_any_range(demo: DemoRecording) -> None:
         estimates = []
         for k, ego in enumerate(true_egos(demo)[:90]):
             vehicles = tuple(
-                VehicleEstimate(
-                    vehicle=body.body, cov=COV, velocity_cov=(0.0,) * 4, age_ns=0, frames=1,
+                new_vehicle(
+                    vehicle=body.body,
                     T_world_vehicle=ego @ SE2(factor * body.T_ego_body.x_m, factor * body.T_ego_body.y_m),
-                    velocity_mps=(5.0, 0.0), length_m=body.length_m, width_m=body.width_m,
+                    velocity_mps=(5.0, 0.0),
+                    length_m=body.length_m,
+                    width_m=body.width_m,
                     moves=Moves.DRIVING if everything or math.hypot(*body.velocity_mps) > 1.0 else Moves.STANDING,
                 )
                 for body in demo.truth_bodies(k)
                 if body.label in VEHICLES
-            )  # fmt: skip
-            estimates.append(
-                Estimate(
-                    epoch=0, frame_id=k, t_source_ns=0, t_capture_ns=0, t_utc_ns=0, T_world_ego=ego, cov=COV,
-                    valid=True, vehicles=vehicles,
-                )
-            )  # fmt: skip
+            )
+            estimates.append(new_estimate(frame_id=k, T_world_ego=ego, vehicles=vehicles))
         return grade(demo, estimates)
 
     right, wrong = told(False, 1.0), told(True, 1.33)

@@ -35,6 +35,7 @@ from birdslam.sources.opening import open_recording
 from birdslam.sources.recording import RecordedFrame, Recording
 from birdslam.trajectory import Transform, inverse, mount_pose, split_pose
 from birdslam.types import Attitude, Estimate, Ground, MapUpdate, Measurements, Status, VehicleEdge, VehicleEstimate
+from tests.records import new_estimate, new_vehicle
 
 CAMERA = Camera(640, 192, 400.0, 400.0, 320.0, 96.0, 1.65)
 COV3, COV2 = (0.0,) * 9, (0.0,) * 4
@@ -186,16 +187,12 @@ class Drive(Recording):
 
 
 def estimate(frame_id: int, T_world_ego: SE2, **fields: object) -> Estimate:
-    return Estimate(
-        epoch=0,
+    return new_estimate(
         frame_id=frame_id,
         t_source_ns=frame_id * 100_000_000,
-        t_capture_ns=0,
-        t_utc_ns=0,
         T_world_ego=T_world_ego,
         cov=(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0),
-        valid=True,
-        **fields,  # type: ignore[arg-type]
+        **fields,
     )
 
 
@@ -289,16 +286,7 @@ def test_a_box_without_returns_has_no_distance() -> None:
 
 
 def vehicle(number: int, pose: SE2) -> VehicleEstimate:
-    return VehicleEstimate(
-        vehicle=number,
-        T_world_vehicle=pose,
-        cov=COV3,
-        velocity_mps=(0.0, 0.0),
-        velocity_cov=COV2,
-        age_ns=0,
-        frames=3,
-        length_m=4.0,
-    )
+    return new_vehicle(vehicle=number, T_world_vehicle=pose, frames=3, length_m=4.0)
 
 
 def test_near_face_does_not_depend_on_which_way_the_car_looks() -> None:

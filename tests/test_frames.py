@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 
 from birdslam.runtime.transport.ring import FrameError, FrameReader, FrameRing
 from birdslam.types import FrameRef
+from tests.records import new_frame_ref
 
 ROOT = Path(__file__).parent.parent
 HEIGHT_PX, WIDTH_PX = 37, 53
@@ -25,17 +26,8 @@ HEIGHT_PX, WIDTH_PX = 37, 53
 def ref_of(image: np.ndarray, place: tuple[int, int], epoch: int) -> FrameRef:
     height_px, width_px = image.shape[:2]
     channels = image.shape[2] if image.ndim == 3 else 1
-    return FrameRef(
-        frame_id=0,
-        t_source_ns=0,
-        t_capture_ns=0,
-        t_utc_ns=0,
-        slot=place[0],
-        sequence=place[1],
-        ring_epoch=epoch,
-        width_px=width_px,
-        height_px=height_px,
-        channels=channels,
+    return new_frame_ref(
+        slot=place[0], sequence=place[1], ring_epoch=epoch, width_px=width_px, height_px=height_px, channels=channels
     )
 
 

@@ -27,6 +27,7 @@ from birdslam.runtime.wire import Trace
 from birdslam.sources.recording import RecordedFrame
 from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, Status
 from tests.recordings import SMALL as CAMERA
+from tests.records import new_estimate
 
 
 class Inbox:
@@ -99,16 +100,8 @@ def receive(node: CaptureNode) -> Message:
 
 def come_back(inbox: Inbox, ref: FrameRef) -> None:
     """What optimize would send of this frame."""
-    estimate = Estimate(
-        epoch=0,
-        frame_id=ref.frame_id,
-        t_source_ns=0,
-        t_capture_ns=0,
-        t_utc_ns=0,
-        T_world_ego=msgspec.convert([0.0, 0.0, 0.0], SE2),
-        cov=(0.0,) * 9,
-        valid=False,
-        status=ref.status,
+    estimate = new_estimate(
+        frame_id=ref.frame_id, T_world_ego=msgspec.convert([0.0, 0.0, 0.0], SE2), valid=False, status=ref.status
     )
     inbox.messages.append(Message(estimate, Trace(), 0))
 

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.camera_scale import with_camera_scale
 from birdslam.outputs.plain_words import MEANINGS, REMEDIES, DriveCounts, LengthsBy, readme, verdict
-from birdslam.types import INVALIDATING, Estimate, Status, VehicleEstimate
+from birdslam.types import INVALIDATING, Status
+from tests.records import new_estimate, new_vehicle
 
 
 def drive(frames: int = 100, invalid: int = 0, **more: object) -> DriveCounts:
@@ -109,14 +110,10 @@ PLACES = st.builds(SE2, st.floats(-500.0, 500.0), st.floats(-500.0, 500.0), st.f
 def test_uncertain_scale_affects_all_distances(
     ego: SE2, car: SE2, u_mps: float, v_mps: float, sigma_rel: float
 ) -> None:
-    vehicle = VehicleEstimate(
-        vehicle=1, T_world_vehicle=car, cov=(0.0,) * 9, velocity_mps=(u_mps, v_mps), velocity_cov=(0.0,) * 4, age_ns=0,
-        frames=3,
-    )  # fmt: skip
-    sure = Estimate(
-        epoch=0, frame_id=1, t_source_ns=1, t_capture_ns=1, t_utc_ns=0, T_world_ego=ego, cov=(0.0,) * 9, valid=True,
-        vehicles=(vehicle,), scale_sigma_rel=0.04,
-    )  # fmt: skip
+    vehicle = new_vehicle(vehicle=1, T_world_vehicle=car, velocity_mps=(u_mps, v_mps), frames=3)  # fmt: skip
+    sure = new_estimate(
+        frame_id=1, t_source_ns=1, t_capture_ns=1, T_world_ego=ego, vehicles=(vehicle,), scale_sigma_rel=0.04
+    )
     assert with_camera_scale(sure, 0.0) is sure
     found = with_camera_scale(sure, sigma_rel)
     assert found.scale_sigma_rel == pytest.approx(math.hypot(0.04, sigma_rel))

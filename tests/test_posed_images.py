@@ -23,7 +23,8 @@ from birdslam.runtime.batch.drive_export import FORMATS, export_drive
 from birdslam.runtime.cli.main import main
 from birdslam.sources.opening import open_recording
 from birdslam.trajectory import ego_pose, inverse, mount_pose, read_kitti, read_tum
-from birdslam.types import Attitude, Estimate
+from birdslam.types import Attitude
+from tests.records import new_estimate
 
 CAMERA = Camera(640, 192, 400.0, 410.0, 320.0, 96.0, 1.65, pitch_rad=0.01)
 COV3 = (0.0,) * 9
@@ -124,18 +125,7 @@ def recorded(folder: Path, frames: int = 40) -> np.ndarray:
             T[:3] = truth[k]
             ego = mount @ T @ inverse(mount)
             pose = SE2(float(ego[0, 3]), float(ego[1, 3]), float(np.arctan2(ego[1, 0], ego[0, 0])))
-            recorder.add(
-                Estimate(
-                    epoch=0,
-                    frame_id=k,
-                    t_source_ns=frame.t_source_ns,
-                    t_capture_ns=0,
-                    t_utc_ns=0,
-                    T_world_ego=pose,
-                    cov=COV3,
-                    valid=k != 3,
-                )
-            )
+            recorder.add(new_estimate(frame_id=k, t_source_ns=frame.t_source_ns, T_world_ego=pose, valid=k != 3))
         source = {"uri": "demo", "stride": 1}
         recorder.finish({"configuration": {"camera": msgspec.to_builtins(recording.camera), "source": source}})
     return truth[:frames]

@@ -21,7 +21,6 @@ import pytest
 from mcap.reader import make_reader
 from msgspec.structs import replace
 
-from birdslam.geometry.se2 import SE2
 from birdslam.runtime.cli.main import main
 from birdslam.runtime.client import Planner
 from birdslam.runtime.configuration import Configuration, ConfigurationError, RecordingConfig, SourceConfig
@@ -48,6 +47,7 @@ from birdslam.runtime.wire import Health, Trace, decode, encode
 from birdslam.sources.camera_file import load_camera
 from birdslam.sources.recording import DatasetError
 from birdslam.types import Estimate, Frame, FrameRef, MapUpdate, Measurements, Status
+from tests.records import new_estimate
 from tests.taped_drive import CAMERA, Tape, measured
 from tests.test_bus import until
 from tests.test_pipeline import HEIGHT, LIMIT_S, UNHURRIED, WIDTH, Run, drive, wait_gone
@@ -476,14 +476,7 @@ def test_recorder_sends_a_heartbeat_per_message(tmp_path: Path) -> None:
 @pytest.mark.parametrize("last", [3, 9])
 def test_measurements_that_are_missing_at_the_end_are_counted(last: int, tmp_path: Path) -> None:
     configuration = Configuration(vehicle="tail", camera=CAMERA)
-    end = Estimate(
-        **stamps(Frame(9, 9, 9, 9, None)),
-        epoch=0,
-        T_world_ego=SE2(),
-        cov=(0.0,) * 9,
-        valid=False,
-        status=(Status.END_OF_SOURCE,),
-    )
+    end = new_estimate(**stamps(Frame(9, 9, 9, 9, None)), valid=False, status=(Status.END_OF_SOURCE,))
     sent: dict[str, list[Any]] = {
         "measurements": [
             Measurements(**stamps(Frame(k, k, k, k, None)), status=(Status.END_OF_SOURCE,) if k == 9 else ())

@@ -23,9 +23,10 @@ from birdslam.outputs.report.drawings import speeds
 from birdslam.outputs.report.drive_table import read_drive
 from birdslam.runtime.cli.main import main
 from birdslam.sources.camera_file import camera_text
-from birdslam.types import Estimate, LaneLine, Lanes, LineKind, MapUpdate, Status, VehicleEstimate
+from birdslam.types import LaneLine, Lanes, LineKind, MapUpdate, Status, VehicleEstimate
 from tests.cases import first
 from tests.chromium import chromium, look
+from tests.records import new_estimate
 from tests.report_pages import LOOKS, faults, moved
 
 pytest.importorskip("plotly", reason="a report is made by plotly (pip install birdslam[report])")
@@ -54,12 +55,10 @@ def results(tmp_path: Path) -> Path:
             )  # fmt: skip
             walker = msgspec.structs.replace(car, vehicle=9, label="pedestrian")
             recorder.add(
-                Estimate(
+                new_estimate(
                     epoch=epoch,
                     frame_id=k,
                     t_source_ns=k * 10**8,
-                    t_capture_ns=0,
-                    t_utc_ns=0,
                     T_world_ego=SE2(0.5 * (k - RESET * epoch), 0.0, 0.0),
                     cov=(0.01,) * 9,
                     valid=k >= 10,

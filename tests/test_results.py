@@ -22,6 +22,7 @@ from birdslam.outputs.placed import ROAD_IN_MAP, Place, write_places
 from birdslam.outputs.scene_recorder import SceneRecorder, Thinned
 from birdslam.trajectory import read_kitti, read_tum
 from birdslam.types import Attitude, Estimate, MapUpdate, Moves, SpeedSource, Status, VehicleEstimate
+from tests.records import new_vehicle
 
 CAMERA = Camera(640, 192, 400.0, 400.0, 320.0, 96.0, 1.65, pitch_rad=0.01)
 COV3, COV2 = (0.0,) * 9, (0.0,) * 4
@@ -42,15 +43,13 @@ def estimate(frame_id: int, pose: SE2, epoch: int = 0, **fields: object) -> Esti
 
 
 def vehicle(number: int, pose: SE2, frames: int, speed_mps: float = 0.0, **fields: object) -> VehicleEstimate:
-    return VehicleEstimate(
+    return new_vehicle(
         vehicle=number,
         T_world_vehicle=pose,
-        cov=COV3,
         velocity_mps=(speed_mps, 0.0),
-        velocity_cov=COV2,
-        age_ns=fields.pop("age_ns", 0),  # type: ignore[arg-type]
+        age_ns=fields.pop("age_ns", 0),
         frames=frames,
-        **fields,  # type: ignore[arg-type]
+        **fields,
     )
 
 

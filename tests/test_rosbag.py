@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 
 from birdslam.bench.ego.trajectory_errors import evaluate_recordings
 from birdslam.geometry.camera import AXES_EGO_CAM, Camera, GroundPlane, Undistorter
-from birdslam.geometry.se2 import SE2
 from birdslam.ros.bag import BagTopics
 from birdslam.ros.sensor import demosaiced, lens, pixels
 from birdslam.runtime.calibration.given import Given, lens_of
@@ -30,6 +29,7 @@ from birdslam.sources.rosbag_truth import east_north_up
 from birdslam.trajectory import as_poses, mount_pose
 from birdslam.types import Estimate
 from tests import ros_bags as ros
+from tests.records import new_estimate
 
 WIDTH, HEIGHT = 64, 32
 PERIOD_NS = 100_000_000
@@ -325,10 +325,7 @@ def test_frames_without_truth_are_named_and_left_out(tmp_path: Path) -> None:
 
     def standing(recording: Recording) -> Iterator[Estimate]:
         for frame in recording.frames():
-            yield Estimate(
-                epoch=0, frame_id=frame.index, t_source_ns=frame.t_source_ns, t_capture_ns=0, t_utc_ns=0,
-                T_world_ego=SE2(), cov=(0.0,) * 9, valid=True,
-            )  # fmt: skip
+            yield new_estimate(frame_id=frame.index, t_source_ns=frame.t_source_ns)  # fmt: skip
 
     with pytest.raises(DatasetError, match=r"known of 3 of 6 frames, from 3 to 5: compare those \(--frames 3:6\)"):
         evaluate_recordings([recording], standing, tmp_path / "out")

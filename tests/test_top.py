@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from birdslam.geometry.se2 import SE2
 from birdslam.runtime.cli.vehicle.top import CLEAR, VehicleTable, top
 from birdslam.runtime.configuration import BudgetsConfig, Configuration
 from birdslam.runtime.topology import NODES
 from birdslam.runtime.transport.bus import Bus
 from birdslam.runtime.wire import Health, Spread, Stage, Trace
 from birdslam.types import Estimate, SpeedSource, Status
+from tests.records import new_estimate
 
 pytestmark = pytest.mark.processes
 
@@ -58,14 +58,10 @@ def vehicle(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 def estimate() -> Estimate:
-    return Estimate(
+    return new_estimate(
         epoch=3,
         frame_id=123,
-        t_source_ns=0,
         t_capture_ns=time.monotonic_ns(),
-        t_utc_ns=0,
-        T_world_ego=SE2(),
-        cov=(0.0,) * 9,
         valid=False,
         status=(Status.CAMERA_DARK,),
         speed_sources=(SpeedSource.ROAD, SpeedSource.CAR),
