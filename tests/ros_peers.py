@@ -1,8 +1,4 @@
-"""Does a listener of ROS 2 hear every estimate, and how late? A vehicle's bus, `birdslam ros`, a router and a listener
-of the independent package zenoh-ros2-sdk, each in a separate process.
-
-    python -m perf ros [--seconds 30] [--rate 33] [--vehicles 10]
-"""
+"""The other side of ROS 2: processes of the independent package zenoh-ros2-sdk, and the estimates that they receive."""
 
 from __future__ import annotations
 
@@ -15,20 +11,10 @@ from contextlib import contextmanager
 import numpy as np
 
 from birdslam.geometry.se2 import SE2
-from birdslam.perf.errors import PerfError
 from birdslam.types import Estimate, VehicleEstimate
 from tests.records import new_estimate
 
-label = "a listener of ROS 2: messages lost, and their age"
 PEER = "tests.ros_peer"
-VEHICLE = "ros-perf"
-HEARD = {
-    "/birdslam/odometry": "nav_msgs/msg/Odometry",
-    "/birdslam/vehicles": "vision_msgs/msg/Detection3DArray",
-    "/tf": "tf2_msgs/msg/TFMessage",
-}
-LIMIT_S = 60.0
-LAST_S = 10.0  # for the last ones to come
 COV = tuple(np.diag([0.01, 0.01, 1e-4]).ravel().tolist())
 
 
@@ -39,8 +25,7 @@ def peer(*arguments: str) -> Iterator[subprocess.Popen[str]]:
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None
-            if process.stdout.readline().strip() != "ready":
-                raise PerfError(f"{PEER} {arguments[0]} did not begin")
+            assert process.stdout.readline().strip() == "ready", f"{PEER} {arguments[0]} did not start"
             yield process
         finally:
             process.kill()

@@ -17,7 +17,7 @@ from birdslam.graph.factors.odometry import Odometry
 from birdslam.graph.factors.standard import standard_factors
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
-from birdslam.graph.state_layout import OF_VEHICLE, StateLayout
+from birdslam.graph.state_layout import OF_VEHICLE
 from birdslam.graph.weights import WeightsConfig
 from birdslam.graph.window import EGO_PLACE, Window
 from birdslam.perf.latency.drive import DriveConfig, drive
@@ -102,36 +102,6 @@ class LaneLine(Factor):
         return Linearised(residual, J, np.array([np.diag(np.square(line.sigmas)) for line in lines]))
 
 
-@dataclass(frozen=True)
-class Loop:
-    """The newest ego pose as an earlier one sees it, its error in the axes of that one's pose in ego."""
-
-    frame: int
-    T_frame_ego: SE2
-    sigma: float
-
-
-class LoopClosure(Factor):
-    """Between the newest pose and one of the window, a CC edge that closes a loop."""
-
-    name = "loop"
-    equation = "Eq. 2"
-
-    def linearise(self, frame: GraphFrame, window: Window) -> Linearised | None:
-        loops = [r for r in frame.records if isinstance(r, Loop) and r.frame in window.node_frames]
-        if not loops:
-            return None
-        index: list[int] = []
-        residual: list[float] = []
-        for loop in loops:
-            node = window.node_frames.index(loop.frame)
-            rows, T = StateLayout.node(node), loop.T_frame_ego.inverse()
-            index += range(rows.start, rows.stop)
-            yaw_rad = float(np.angle(np.exp(1j * T.yaw_rad) / window.heading[node]))
-            residual += (T.x_m - window.at[node].real, T.y_m - window.at[node].imag, yaw_rad)
-        return Linearised(residual, index, np.array([loop.sigma**2 * np.eye(3) for loop in loops]))
-
-
 def graph_with(*more: Factor, epoch: int = 0) -> PoseGraph:
     return PoseGraph(*SETTINGS, epoch, [*standard_factors(*SETTINGS), *more])
 
@@ -173,17 +143,6 @@ def test_fix_moves_the_ego_by_its_share_of_information(sigma_m: float) -> None:
     if sigma_m == 1e-3:
         assert after.T_world_ego.x_m - before.T_world_ego.x_m == pytest.approx(away_m[0], abs=1e-3)
         assert after.T_world_ego.y_m - before.T_world_ego.y_m == pytest.approx(away_m[1], abs=1e-3)
-
-
-def test_visible_vehicles_move_with_the_ego() -> None:
-    """A fix does not change the vehicles' poses relative to the ego, except through correlation with landmarks."""
-    before = run(graph_with(), {})[-1]
-    after = run(graph_with(Gnss()), {LOG[-1].frame_id: (fix_at(before, (0.2, 0.1), 0.05),)})[-1]
-    assert len(before.vehicles) == 3
-    for b, a in zip(before.vehicles, after.vehicles, strict=True):
-        gap = before.T_world_ego.between(b.T_world_vehicle).between(after.T_world_ego.between(a.T_world_vehicle))
-        assert np.abs(gap.log()).max() < 0.01
-        assert b.T_world_vehicle.between(a.T_world_vehicle).log()[0] != pytest.approx(0.0, abs=0.01)
 
 
 def test_only_the_wrong_fix_of_a_frame_is_an_outlier() -> None:
@@ -253,22 +212,6 @@ def test_line_constrains_lateral_position_and_heading() -> None:
     assert_is(after, updated(before, J, np.array([0.2, -0.02]), np.diag(np.square(line.sigmas))))
 
 
-def test_unit_vectors_may_be_given_as_a_jacobian() -> None:
-    """The way by rows of P, and that by products with H, are one."""
-
-    class Dense(Gnss):
-        def linearise(self, frame: GraphFrame, window: Window) -> Linearised | None:
-            term = super().linearise(frame, window)
-            if term is not None:
-                term.jacobian = np.eye(window.layout.size)[term.jacobian]
-            return term
-
-    records = {e.frame_id: (fix_at(e, (0.1, 0.1), 0.1),) for e in run(graph_with(), {})}
-    for a, b in zip(run(graph_with(Gnss()), records), run(graph_with(Dense()), records), strict=True):
-        assert a.T_world_ego.between(b.T_world_ego).log() == pytest.approx(np.zeros(3), abs=1e-9)
-        np.testing.assert_allclose(a.cov, b.cov, rtol=1e-6, atol=1e-12)
-
-
 # --- vehicles apart, and together ---
 
 
@@ -330,32 +273,6 @@ def test_line_of_a_vehicle_is_the_same_edge_jointly_and_separately() -> None:
         assert a.cov == pytest.approx(b.cov, rel=1e-6, abs=1e-9)
         assert a.velocity_mps == pytest.approx(b.velocity_mps, rel=1e-6, abs=1e-7)
         assert a.T_world_vehicle.between(b.T_world_vehicle).log() == pytest.approx(np.zeros(3), abs=1e-7)
-
-
-# --- a loop between two poses of the window ---
-
-
-def test_loop_edge_corrects_the_ego() -> None:
-    back, sigma = LOG[-4].frame_id, 1e-3
-    plain, looped = graph_with(), graph_with(LoopClosure())
-    run(plain, {})
-    assert plain.window is not None
-    node = plain.window.node_frames.index(back)
-
-    def ego_from_node(graph: PoseGraph) -> SE2:
-        window = graph.window
-        assert window is not None
-        at = window.at[node]
-        return SE2(at.real, at.imag, float(np.angle(window.heading[node]))).inverse()
-
-    measured = ego_from_node(plain) @ SE2(0.05, -0.02, 0.004)
-    run(looped, {LOG[-1].frame_id: (Loop(back, measured, sigma),)})
-    gap = ego_from_node(looped).between(measured)
-    assert np.abs(gap.log()).max() < 0.2 * 0.05
-    rows = StateLayout.node(node)
-    P, R = plain.window.P[rows, rows], (sigma**2 + 1e-8) * np.eye(3)
-    assert looped.window is not None
-    np.testing.assert_allclose(looped.window.P[rows, rows], P - P @ np.linalg.inv(P + R) @ P, rtol=1e-4, atol=1e-10)
 
 
 # --- the list is data ---

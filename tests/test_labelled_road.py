@@ -52,11 +52,3 @@ def test_labels_tell_the_road_and_images_err_from_it_as_they_do() -> None:
         assert grounds[-1] is not None
         errors.append((last.ground.pitch_rad - grounds[-1].pitch_rad) / last.pitch_sigma_rad)
     assert 0.6 < float(np.std(errors)) < 1.4
-
-
-def test_a_standing_ego_is_told_no_tilt() -> None:
-    sequence, rng = sequence_of(), np.random.default_rng(0)
-    simulated = SimulatedOdometry(CAMERA, sequence.camera_poses, EXACT, rng)
-    odometry = TiltFromImages(simulated, labelled_grounds(sequence), OdometryNoise(), rng)
-    motions = [odometry.estimate(None, frame, 0, np.zeros((0, 4))) for frame in range(5)]
-    assert all(motion.ground == CAMERA.ground for motion in motions if motion is not None)

@@ -97,14 +97,6 @@ def test_an_exact_world_has_hardly_any_error(sequence: TrackingSequence, exact_l
         assert errors.frames >= trial.frames_labelled[car] - 4  # a track is confirmed by its third sight
 
 
-def test_a_log_can_be_made_twice(sequence: TrackingSequence, tmp_path: Path) -> None:
-    root = tracking_world.write(tmp_path)
-    once, twice, other = (log_of(sequence, root, SimulationConfig(), seed) for seed in (1, 1, 2))
-    assert once == twice
-    assert once != other
-    assert sum(len(m.cp) for m in once) > len(FRAMES)
-
-
 def test_frames_may_start_anywhere(sequence: TrackingSequence, exact_log: list[Measurements]) -> None:
     truth = Truth.of(sequence, exact_log[10:])
     assert truth.ego[10].x_m == 0.0
