@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.planar import between
@@ -165,7 +165,7 @@ def weigh(error: Floats, cov: Iterable[float]) -> float:
 def assert_honest(name: str, values: list[float], dimensions: int, least: int) -> None:
     """The mean lies within its 95 % bounds."""
     assert len(values) >= least
-    low, high = chi2.ppf([0.025, 0.975], dimensions * len(values)) / len(values)
+    low, high = chdtri(dimensions * len(values), [0.975, 0.025]) / len(values)
     assert low <= np.mean(values) <= high, name
 
 

@@ -1,6 +1,7 @@
 """The front end: chained motions, edges that name their frames, and statuses without measurements."""
 
 import dataclasses
+import functools
 import math
 from typing import Any
 
@@ -191,6 +192,7 @@ def test_late_segmentation_is_mapped_once_at_its_own_pose() -> None:
     assert [p.x_m for p in out[2].lanes] == pytest.approx([p.x_m - 4.0 for p in now])
 
 
+@functools.cache
 def road_view() -> Ready:
     """A straight road with a line on either side, without vehicles."""
     rows, columns = np.mgrid[: CAMERA.height_px, : CAMERA.width_px]
