@@ -2,6 +2,7 @@
 
 import json
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import geojson
@@ -18,7 +19,7 @@ from birdslam.perf.maps.places import CAMERA, along, build, drive
 from birdslam.runtime.maps.map_export import export_map
 from birdslam.types import LaneLine, Lanes, LineColour, LineKind
 
-STREET = build(along([0.0] * 60 + [0.01] * 60), seed=1)
+STREET = replace(build(along([0.0] * 60 + [0.01] * 60), seed=1), max_seen=120)
 LINES = {3: (1.75, LineKind.DASHED), 4: (-1.75, LineKind.SOLID)}
 COV4 = tuple(np.diag([0.02**2, 0.002**2, 1e-8, 1e-12]).ravel().tolist())
 

@@ -43,8 +43,8 @@ from birdslam.types import Attitude, Estimate
 from tests import drifting_scale
 from tests.cases import first
 
-STREET = build(along([0.0] * 70 + [0.004] * 90), seed=1)
-OTHER = build(along([0.0] * 200), seed=2)
+STREET = replace(build(along([0.0] * 70 + [0.004] * 90), seed=1), max_seen=120)
+OTHER = replace(build(along([0.0] * 200), seed=2), max_seen=120)
 
 
 def session(place_map: PlaceMap, extend: bool) -> MapSession:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from pathlib import Path
 
@@ -60,6 +61,7 @@ def test_rows_are_those_of_the_raw_image(fisheye: bool) -> None:
     assert abs(rows[0] - ((340.5) / 360 - 0.5)) > 0.02  # the lens bends that one
 
 
+@functools.cache
 def road_read_in_turn(way_m: float, readout_s: float) -> np.ndarray:
     """The image of a level road with blotches, each of whose rows is seen from where the camera is then."""
     v, u = np.mgrid[:360, :640].astype(np.float64)

@@ -37,6 +37,7 @@ class Street:
     route: Floats
     corners_m: Floats  # (M, 3)
     descriptors: NDArray[np.uint8]  # (M, 32)
+    max_seen: int = MAX_SEEN  # corners of an image
 
     def see(
         self, T_world_ego: SE2, chance: np.random.Generator, bits: float = SAME_BITS, pitch_rad: float = 0.0
@@ -51,7 +52,7 @@ class Street:
         px = CAMERA.to_px(p[:, :2] / p[:, 2:])
         inside = ((px > 0.0) & (px < (CAMERA.width_px, CAMERA.height_px))).all(axis=1)
         near, px = near[inside], px[inside]
-        seen = np.sort(chance.permutation(len(near))[:MAX_SEEN])
+        seen = np.sort(chance.permutation(len(near))[: self.max_seen])
         near, px = near[seen], px[seen] + NOISE_PX * chance.standard_normal((len(seen), 2))
         flips = np.packbits(chance.random((len(near), 8 * DESCRIPTOR_BYTES)) < bits, axis=1)
         return Features(px, np.full(len(px), NOISE_PX), self.descriptors[near] ^ flips)
