@@ -392,14 +392,14 @@ def test_recorder_restarts_with_a_new_file_until_the_disk_is_full(
         ) as run,
         Planner(run.vehicle, run.runtime_dir) as planner,
     ):
-        drive_on(planner, 20)
+        drive_on(planner, 12)
         fault(run)
-        drive_on(planner, 20)  # it goes on meanwhile
+        drive_on(planner, 12)  # it goes on meanwhile
         until(lambda: files[1].is_file() and files[1].stat().st_size > 0, "its successor writes")
         until(lambda: any(Recording(files[1]).messages(("/health/record",))), "it has said how it is, once a second")
-        limit = files[1].stat().st_size + 20_000  # no file of its process may grow past it: the write fails
+        limit = files[1].stat().st_size + 10_000  # no file of its process may grow past it: the write fails
         resource.prlimit(run.node_pid("record"), resource.RLIMIT_FSIZE, (limit, limit))
-        drive_on(planner, 60)
+        drive_on(planner, 40)
         out = run.stop()
     assert f"record {cause}; it is being restarted" in out
     assert "the recording has ended: File too large" in out
