@@ -17,7 +17,7 @@ from birdslam.perf.latency import system, transport
 from birdslam.perf.latency.live import Run, Sample
 from birdslam.perf.reporting import all as everything
 from birdslam.perf.reporting import check, report
-from birdslam.perf.reporting.figures import Ledger, curve, spread
+from birdslam.perf.reporting.figures import Ledger, spread
 from birdslam.runtime.cli import main as birdslam
 from birdslam.runtime.transport.bus import Message
 from birdslam.runtime.wire import Stage, Trace
@@ -137,7 +137,6 @@ def test_report_names_missing_results(tmp_path: Path) -> None:
     row = {
         **{"carrier": "ring", "bytes": 200, "rate_hz": 33, "load": 0, "sent": 100, "dropped": 1, "steal_percent": 0.0},
         "latency_ms": spread([1.0, 2.0]),
-        "curve_ms": curve([1.0, 2.0]),
         "cpu_percent": {"sender": 1.0, "receiver": 2.0},
     }
     content = _content({"system": run, "transport": {"rows": [{"name": "ring 200 B", **row}]}})

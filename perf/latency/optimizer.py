@@ -36,7 +36,7 @@ from birdslam.graph.weights import WeightsConfig
 from birdslam.perf.latency.drive import DriveConfig, drive
 from birdslam.perf.latency.smoothers import Smoother
 from birdslam.perf.reporting.arguments import benchmark_parser, numbers
-from birdslam.perf.reporting.figures import Ledger, curve, spread
+from birdslam.perf.reporting.figures import Ledger, spread
 from birdslam.perf.reporting.machine import Steal
 from birdslam.types import FIRST_PERSON, FollowedPerson, Measurements
 
@@ -51,7 +51,6 @@ class Contender(Protocol):
 
 REPEATS = 3
 _WARM_UP = 100  # frames before memory is measured
-_PARTS = 50  # of a drive, for the plot over frames
 _LAG_FRAMES = GraphConfig().ego_nodes
 
 
@@ -131,16 +130,13 @@ def _drive_through(contender: str, vehicles: int, log: Path, limit_s: float) -> 
     gc.freeze()
     process = psutil.Process()
     times_us, cpu_us = np.zeros(len(records)), np.zeros(len(records))
-    kinds = np.full(len(records), "other", dtype="<U8")
     rss_before = process.memory_info().rss
     begun_s = time.perf_counter()
-    frames, seen = 0, set[int]()
+    frames = 0
     broken_off = np.zeros(len(records), dtype=np.bool_)
     steal = Steal()
     for frame, record in enumerate(records):
         measurements = decoder.decode(record)
-        seen, before = {edge.vehicle for edge in measurements.cv}, seen
-        kinds[frame] = "traffic" if seen != before else "cp" if measurements.cp else "other"
         switches = resource.getrusage(resource.RUSAGE_THREAD).ru_nivcsw
         cpu_ns, before_ns = time.process_time_ns(), time.perf_counter_ns()
         try:
@@ -171,17 +167,12 @@ def _drive_through(contender: str, vehicles: int, log: Path, limit_s: float) -> 
         "max_us": round(times_us.max(), 1),
         # CPU time of all its threads, which the load of other processes affects only through caches
         "cpu_p50_us": round(float(np.median(cpu_us[:frames])), 1),
-        "cpu_p99_us": round(float(np.percentile(cpu_us[:frames], 99.0)), 1),
         "first_thousand_p50_us": round(np.median(times_us[:1000]), 1),
         "last_thousand_p50_us": round(np.median(times_us[-1000:]), 1),
         "rss_growth_mb": round((rss - rss_before) / 2**20, 2),
         "exceptions": exceptions,
         "steal_percent": steal.percent(),
-        "preempted": round(float(broken_off[:frames].mean()), 4),
         "undisturbed_p99_us": round(spread(times_us[~broken_off[:frames]]).get("p99", p99), 1),
-        "kinds_us": {kind: spread(times_us[kinds[:frames] == kind]) for kind in ("cp", "traffic", "other")},
-        "curve_us": curve(times_us),
-        "over_frames_us": [round(float(np.median(part)), 1) for part in np.array_split(times_us, _PARTS) if part.size],
     }
 
 

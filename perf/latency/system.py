@@ -17,7 +17,7 @@ import numpy as np
 from birdslam.geometry.arrays import Floats
 from birdslam.perf.latency.live import Ask, Run, add_run_options, drive
 from birdslam.perf.reporting.arguments import benchmark_parser
-from birdslam.perf.reporting.figures import Ledger, curve, spread, spread_text
+from birdslam.perf.reporting.figures import Ledger, spread, spread_text
 from birdslam.perf.reporting.machine import Steal
 from birdslam.runtime.configuration import BudgetsConfig
 from birdslam.runtime.doctor.costs import busy_cores
@@ -91,7 +91,6 @@ def figures(result: Run, warm_up_s: float = 0.0) -> dict[str, Any]:
             name: spread(gone(values)) | {"mean": _mean(values), "mean_in_tail": _mean(values[late])}
             for name, values in parts_ms.items()
         },
-        "age_curve_ms": curve(age_ms),
         "statuses": summary["statuses"],
         "restarts": summary["restarts"],
         "budgets": list(budgets(summary["configuration"]["budgets"], age_ms, parts_ms)),

@@ -18,7 +18,7 @@ from typing import Any
 
 from birdslam.perf.latency.carriers import CARRIERS
 from birdslam.perf.reporting.arguments import benchmark_parser, numbers
-from birdslam.perf.reporting.figures import Ledger, curve, spread, spread_text
+from birdslam.perf.reporting.figures import Ledger, spread, spread_text
 from birdslam.perf.reporting.machine import Steal
 from birdslam.runtime.doctor.costs import busy_cores
 
@@ -105,7 +105,6 @@ def measure(case: Case, seconds: float) -> dict[str, Any]:
         "rate_hz": case.rate_hz,
         "load": case.load,
         "latency_ms": spread(latency_ms),
-        "curve_ms": curve(latency_ms),
         "cpu_percent": {
             "sender": round(100.0 * sent["cpu_s"] / sent["took_s"], 2),
             "receiver": round(100.0 * received["cpu_s"] / sent["took_s"], 2),

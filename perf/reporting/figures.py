@@ -11,10 +11,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from birdslam.geometry.arrays import Floats
 from birdslam.perf.reporting.machine import Steal, describe, describe_text
-
-_LEVELS = (0.0, 1.0, 5.0, *range(10, 91, 10), 95.0, 98.0, 99.0, 99.5, 99.9, 99.99)  # percent, for the plots
 
 
 def spread(values: ArrayLike) -> dict[str, float]:
@@ -25,15 +22,6 @@ def spread(values: ArrayLike) -> dict[str, float]:
     p50, p99, p999 = np.percentile(series, [50.0, 99.0, 99.9])
     found = {"p50": p50, "p99": p99, "p999": p999, "max": series.max()}
     return {name: round(float(value), 4) for name, value in found.items()} | {"n": int(series.size)}
-
-
-def curve(values: ArrayLike) -> list[list[float]]:
-    """(percent, value) pairs of the cumulative distribution, denser in the tail, as far as the samples allow."""
-    series: Floats = np.asarray(values, dtype=np.float64)
-    if not series.size:
-        return []
-    levels = [level for level in _LEVELS if level <= 100.0 * (1.0 - 1.0 / series.size)]
-    return [[level, round(float(np.percentile(series, level)), 4)] for level in levels]
 
 
 class Ledger:
