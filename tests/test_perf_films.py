@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from birdslam.geometry.camera import Camera
 from birdslam.perf.accuracy.films import CAMERAS, FILMS, camera_of
-from birdslam.perf.robustness.film_figures import Course, over, summary
+from birdslam.perf.robustness.film_figures import Step, over, summary
 from birdslam.perf.robustness.film_variants import PARTS, Timed, Variant, variants
 
 CAMERA = Camera(640, 360, 500.0, 500.0, 318.0, 181.0, height_m=1.4)
@@ -61,11 +61,11 @@ def test_uneven_true_steps_do_not_affect_the_ratio_at_any_rate() -> None:
     """As in KITTI: distances per second are compared, not frames."""
     courses = []
     for every in (1, 2):
-        course = Course()
+        steps = []
         for k in range(every, 61, every):
             true = sum(1.2 if step % 3 == 0 else 0.9 for step in range(k - every, k))
-            course.add(0.1 * k, 0.1 * every, 10.0, 10.0 * true / every, valid=k > 5, sigma_rel=0.02)
-        courses.append(summary(course))
+            steps.append(Step(0.1 * k, 0.1 * every, 10.0, 10.0 * true / every, valid=k > 5, sigma_rel=0.02))
+        courses.append(summary(steps))
     ratio = over(courses[1], courses[0])
     assert ratio is not None
     assert abs(ratio - 1.0) < 0.015

@@ -29,7 +29,7 @@ from birdslam.perf.reporting.arguments import add_data, add_networks, benchmark_
 from birdslam.perf.reporting.figures import Ledger
 from birdslam.perf.robustness.film_figures import (
     BEGINNING_S,
-    Course,
+    Step,
     TrueSpeed,
     over,
     row_text,
@@ -113,10 +113,10 @@ def measure_all(options: argparse.Namespace) -> None:
                     seen = looks(recording, span_s, configuration)
                     unchanged: dict[str, Any] | None = None
                     for variant in variants(recording.camera, part):
-                        course = drive(recording, variant, span_s, true_mps, seen)
-                        if not course.t_s or course.t_s[-1] <= BEGINNING_S:
+                        steps = drive(recording, variant, span_s, true_mps, seen)
+                        if not steps or steps[-1].t_s <= BEGINNING_S:
                             continue  # the film ends before its speed counts
-                        figures = summary(course, between_mps)
+                        figures = summary(steps, between_mps)
                         unchanged = unchanged or figures
                         figures["way_over_unchanged"] = over(figures, unchanged)
                         started = "" if begin_s == 0.0 else f", from {begin_s:g} s"
@@ -137,11 +137,11 @@ def drive(
     span_s: tuple[float, float],
     true_mps: TrueSpeed,
     looks: Callable[[int], Seen],
-) -> Course:
+) -> list[Step]:
     """Runs the odometry on a variant of a film from `span_s`[0] to `span_s`[1], with the networks' results by time."""
     camera = variant.camera(recording.camera)
     odometry, undistort = Odometry(camera), Undistorter(camera)
-    course, times_ns = Course(), list[int]()
+    steps, times_ns = list[Step](), list[int]()
     for k, (t_ns, raw) in enumerate(variant.images(_within(recording, span_s))):
         times_ns.append(t_ns)
         boxes_px, road = _at_size(looks(t_ns), recording.camera, camera)
@@ -153,8 +153,8 @@ def drive(
         mps = float(np.linalg.norm(motion.t_prev_curr_m)) / (end_s - begin_s)
         at_s = end_s - times_ns[0] / NS_PER_S
         true, sigma_rel = true_mps(begin_s, end_s), math.hypot(motion.scale_sigma_rel, camera.scale_sigma_rel)
-        course.add(at_s, end_s - begin_s, mps, true, is_valid(motion), sigma_rel, motion.standstill)
-    return course
+        steps.append(Step(at_s, end_s - begin_s, mps, true, is_valid(motion), sigma_rel, motion.standstill))
+    return steps
 
 
 def looks(

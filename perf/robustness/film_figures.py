@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,45 +13,21 @@ BEGINNING_S = 2.0  # time after which estimates should be valid
 MIN_SPEED_MPS = 1.0  # below it a ratio of speeds is meaningless
 
 
-@dataclass
-class Course:
-    """The motions of a variant: end and duration (s), speed and true speed (m/s), validity.
+class Step(NamedTuple):
+    """A motion of a variant: its end and duration, speed and true speed, and whether it is valid."""
 
-    `sigma_rel` is the relative 1-sigma of its length, including the camera's; `stands` whether it reports standstill.
-    """
-
-    t_s: list[float] = field(default_factory=list)
-    lasts_s: list[float] = field(default_factory=list)
-    speed_mps: list[float] = field(default_factory=list)
-    true_mps: list[float] = field(default_factory=list)
-    valid: list[bool] = field(default_factory=list)
-    sigma_rel: list[float] = field(default_factory=list)
-    stands: list[bool] = field(default_factory=list)
-
-    def add(
-        self,
-        t_s: float,
-        lasts_s: float,
-        speed_mps: float,
-        true_mps: float,
-        valid: bool,
-        sigma_rel: float,
-        stands: bool = False,
-    ) -> None:
-        """Adds a motion."""
-        self.t_s.append(t_s)
-        self.lasts_s.append(lasts_s)
-        self.speed_mps.append(speed_mps)
-        self.true_mps.append(true_mps)
-        self.valid.append(valid)
-        self.sigma_rel.append(sigma_rel)
-        self.stands.append(stands)
+    t_s: float
+    lasts_s: float
+    speed_mps: float
+    true_mps: float
+    valid: bool
+    sigma_rel: float  # 1-sigma of its length, including the camera's
+    stands: bool = False  # whether it reports standstill
 
 
-def summary(course: Course, between_mps: tuple[float, float] = (0.0, np.inf)) -> dict[str, Any]:
+def summary(steps: Sequence[Step], between_mps: tuple[float, float] = (0.0, np.inf)) -> dict[str, Any]:
     """The results of a row; `between_mps` are the bounds of the true speed."""
-    t_s, valid, true_mps = np.array(course.t_s), np.array(course.valid, bool), np.array(course.true_mps)
-    speed_mps = np.array(course.speed_mps)
+    t_s, _, speed_mps, true_mps, valid, sigma_rel, stands = _columns(steps)
     ratio = speed_mps / np.maximum(true_mps, 0.1)
     late = t_s > BEGINNING_S
     counted = valid & late & (true_mps > MIN_SPEED_MPS)
@@ -64,36 +39,43 @@ def summary(course: Course, between_mps: tuple[float, float] = (0.0, np.inf)) ->
         "first_valid_s": float(t_s[valid.argmax()]) if valid.any() else None,
         "speed_over_truth": median,
         "deviation": None if median is None else float(np.median(np.abs(ratio[counted] / median - 1.0))),
-        "sigma_rel": float(np.median(np.array(course.sigma_rel)[counted])) if counted.any() else None,
-        "by_second": _by_second(course),
-        "beyond_s": _beyond_s(course),
-        "standstill": int((np.array(course.stands, bool) & (true_mps > MIN_SPEED_MPS)).sum()),
+        "sigma_rel": float(np.median(sigma_rel[counted])) if counted.any() else None,
+        "by_second": (by_second := _by_second(steps)),
+        "beyond_s": _beyond_s(steps, by_second),
+        "standstill": int((stands & (true_mps > MIN_SPEED_MPS)).sum()),
         "outside": int((valid & ((speed_mps < between_mps[0]) | (speed_mps > between_mps[1]))).sum()),
     }
 
 
-def _by_second(course: Course) -> list[float | None]:
+def _columns(steps: Sequence[Step]) -> tuple[Any, ...]:
+    """An array per field of the steps."""
+    columns = np.array(steps, np.float64).reshape(-1, len(Step._fields)).T
+    return tuple(
+        column > 0.0 if name in ("valid", "stands") else column
+        for name, column in zip(Step._fields, columns, strict=True)
+    )
+
+
+def _by_second(steps: Sequence[Step]) -> list[float | None]:
     """Ratio of estimated to true distance of the valid motions of each second.
 
     Ratios of distances rather than frames: KITTI's true steps are uneven, so a median over frames depends on the rate.
     """
-    t_s, lasts_s, valid = np.array(course.t_s), np.array(course.lasts_s), np.array(course.valid, bool)
-    way_m, true_m = np.array(course.speed_mps) * lasts_s, np.array(course.true_mps) * lasts_s
+    t_s, lasts_s, speed_mps, true_mps, valid, *_ = _columns(steps)
     out: list[float | None] = []
     for second in range(int(t_s[-1]) + 1 if len(t_s) else 0):
         here = valid & (t_s >= second) & (t_s < second + 1)
-        true = float(true_m[here].sum())
-        out.append(round(float(way_m[here].sum()) / true, 3) if true > 0.1 else None)
+        true_m = float((true_mps * lasts_s)[here].sum())
+        out.append(round(float((speed_mps * lasts_s)[here].sum()) / true_m, 3) if true_m > 0.1 else None)
     return out
 
 
-def _beyond_s(course: Course) -> int:
+def _beyond_s(steps: Sequence[Step], by_second: Sequence[float | None]) -> int:
     """Number of seconds with a distance error over two sigma."""
-    t_s, valid, sigma_rel = np.array(course.t_s), np.array(course.valid, bool), np.array(course.sigma_rel)
     beyond = 0
-    for second, ratio in enumerate(_by_second(course)):
-        here = valid & (t_s >= second) & (t_s < second + 1)
-        beyond += ratio is not None and abs(np.log(max(ratio, 1e-3))) > 2.0 * float(np.median(sigma_rel[here]))
+    for second, ratio in enumerate(by_second):
+        sigmas = [step.sigma_rel for step in steps if step.valid and second <= step.t_s < second + 1]
+        beyond += ratio is not None and abs(np.log(max(ratio, 1e-3))) > 2.0 * float(np.median(sigmas))
     return beyond
 
 
