@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from birdslam.geometry import bev
-from birdslam.geometry.camera import PLANE_AT_M, Camera, GroundPlane, VerticalCurvature
+from birdslam.geometry.camera import PLANE_AT_M, GroundPlane, VerticalCurvature
+from birdslam.geometry.se2 import SE2
 from birdslam.vehicles.placement.localisation import (
-    DIMENSIONS,
     LocalisationConfig,
     Observation,
     extent_m,
@@ -20,9 +19,9 @@ from birdslam.vehicles.state.ground_measurements import COMMON
 from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
 from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter, estimate_curvature
 from birdslam.vehicles.state.parallax import LearnedSize
+from tests.boxes import CAR, cuboid_px, footprint_m
+from tests.recordings import KITTI as CAMERA
 
-CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
-CAR = DIMENSIONS["car"]
 LOCALISATION = LocalisationConfig()
 NO_OUTLIERS = np.zeros((1, 2))
 IMAGE_COV = np.diag([0.001, 0.002]) ** 2
@@ -39,10 +38,7 @@ class Road:
         self.rng = np.random.default_rng(3)
 
     def box(self, x_m: float, y_m: float, height_m: float, lift_m: float = 0.0) -> np.ndarray:
-        half = [(sl * CAR.length_m / 2, sw * CAR.width_m / 2) for sl in (-1, 1) for sw in (-1, 1)]
-        corners = [(x_m + x, y_m + y, z + lift_m) for x, y in half for z in (0.0, height_m)]
-        px = bev.ego_to_pixel(CAMERA, self.truth, np.array(corners))
-        return np.array([*px.min(axis=0), *px.max(axis=0)])
+        return cuboid_px(footprint_m(SE2(x_m, y_m)), height_m, self.truth, lift_m=lift_m)
 
     def see(
         self, boxes: dict[int, np.ndarray], dt_s: float = 0.1, vertical: VerticalCurvature | None = None

@@ -8,27 +8,21 @@ import numpy as np
 import pytest
 
 from birdslam.bench.tracking.localisation import INSIDE_2_SIGMA
-from birdslam.geometry import bev
 from birdslam.geometry.arrays import Floats
-from birdslam.geometry.camera import Camera
-from birdslam.vehicles.placement.localisation import DIMENSIONS, LocalisationConfig, Observation, observe_boxes, place
+from birdslam.geometry.se2 import SE2
+from birdslam.vehicles.placement.localisation import LocalisationConfig, Observation, observe_boxes, place
 from birdslam.vehicles.placement.uncertain_yaw import HeadingConfig, YawPrior, initial_yaw_rad, marginalise_yaw
+from tests.boxes import CAR, cuboid_px, footprint_m
+from tests.recordings import KITTI as CAMERA
 
-CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
-CAR = DIMENSIONS["car"]
 CONFIG, LOCALISATION = HeadingConfig(), LocalisationConfig()
 SIGMA_DEPTH = 0.03
 
 
 def car_at(centre_m: Floats, yaw_rad: float, noise_px: Floats, stretch: float = 1.0) -> tuple[Observation, float]:
     """Its box, and the true depth of its nearest face; `stretch` of its length and width."""
-    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
-    half = np.array([(sl * CAR.length_m / 2, sw * CAR.width_m / 2) for sl in (-1, 1) for sw in (-1, 1)]) * stretch
-    corners = centre_m + half @ np.array([[c, s], [-s, c]])
-    px = bev.ego_to_pixel(
-        CAMERA, CAMERA.ground, np.vstack([np.column_stack([corners, np.full(4, z)]) for z in (0, 1.5)])
-    )
-    box = np.array([*px.min(axis=0), *px.max(axis=0)]) + noise_px
+    corners = footprint_m(SE2(*centre_m, yaw_rad), stretch * CAR.length_m, stretch * CAR.width_m)
+    box = cuboid_px(corners, 1.5) + noise_px
     (seen,) = observe_boxes(box[None], np.ones(1), ("car",), CAMERA, CAMERA.ground, LOCALISATION)
     return seen, float(corners[:, 0].min())
 

@@ -7,29 +7,26 @@ import math
 import numpy as np
 import pytest
 
-from birdslam.geometry import bev
-from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.vehicles.placement.depth_fusion import PseudoLidarConfig
-from birdslam.vehicles.placement.localisation import DIMENSIONS, LocalisationConfig, observe_boxes
+from birdslam.vehicles.placement.localisation import LocalisationConfig, observe_boxes
 from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
 from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
 from birdslam.vehicles.track import EgoFrame, TrackingConfig
 from birdslam.vehicles.tracking import Tracker
+from tests.boxes import CAR, car_px
+from tests.recordings import KITTI as CAMERA
 
-CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
-CAR, LOCALISATION = DIMENSIONS["car"], LocalisationConfig()
+LOCALISATION = LocalisationConfig()
 CONFIG = GroundSizeConfig()
 DT_S, STEP_M = 0.1, 1.0
 
 
 def box_of(x_m: float, y_m: float, ground: GroundPlane, height_m: float, edge_m: float = 0.0) -> np.ndarray:
     """Of a car headed like the ego with its centre there; its lower edge is drawn `edge_m` below the road."""
-    corners = np.array([(x_m + sl * CAR.length_m / 2, y_m + sw * CAR.width_m / 2) for sl in (-1, 1) for sw in (-1, 1)])
-    points = np.vstack([np.column_stack([corners, np.full(4, z)]) for z in (0.0, height_m)])
-    px = bev.ego_to_pixel(CAMERA, ground, points)
-    near_m = float(corners[:, 0].min())
-    return np.array([*px.min(axis=0), px.max(axis=0)[0], px.max(axis=0)[1] + 721.5 * edge_m / near_m])
+    below_px = CAMERA.fy_px * edge_m / (x_m - CAR.length_m / 2)
+    return np.add(car_px(SE2(x_m, y_m), height_m, ground), [0.0, 0.0, 0.0, below_px])
 
 
 @pytest.mark.slow  # test_ground_size_filter.py has the law

@@ -8,11 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from birdslam.geometry import bev
-from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.vehicles.placement.localisation import (
-    DIMENSIONS,
     LocalisationConfig,
     Observation,
     Place,
@@ -22,20 +20,16 @@ from birdslam.vehicles.placement.localisation import (
     observe_boxes,
     place,
 )
+from tests.boxes import CAR, car_px
+from tests.recordings import KITTI as CAMERA
 
-CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
 GROUND = GroundPlane(1.65, 0.01, 0.0)
 CONFIG = LocalisationConfig()
-CAR = DIMENSIONS["car"]
 
 
 def box_of_car(x_m: float, y_m: float, yaw_rad: float = 0.0) -> np.ndarray:
     """The 2-D box of a cuboid of the class's size, its footprint's centre at (x_m, y_m)."""
-    half = [(sl * CAR.length_m / 2, sw * CAR.width_m / 2) for sl in (-1, 1) for sw in (-1, 1)]
-    footprint = SE2(x_m, y_m, yaw_rad) @ np.array(half)
-    corners = np.vstack([np.column_stack([footprint, np.full(4, z)]) for z in (0.0, CAR.height_m)])
-    px = bev.ego_to_pixel(CAMERA, GROUND, corners)
-    return np.array([*px.min(axis=0), *px.max(axis=0)])
+    return car_px(SE2(x_m, y_m, yaw_rad), ground=GROUND)
 
 
 def observe(

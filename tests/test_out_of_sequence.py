@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from birdslam.frontend import FrontEnd, FrontEndConfig
-from birdslam.geometry import bev
 from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.graph_config import GraphConfig
@@ -19,14 +18,14 @@ from birdslam.perception import Detections, Perception, Ready
 from birdslam.perception.decoding.detection import EdgeSigma
 from birdslam.types import Measurements
 from birdslam.vehicles.out_of_sequence import OpenFrame, OutOfSequenceConfig, OutOfSequenceTracker
-from birdslam.vehicles.placement.localisation import DIMENSIONS, LocalisationConfig, iou
+from birdslam.vehicles.placement.localisation import LocalisationConfig, iou
 from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
 from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
 from birdslam.vehicles.track import EgoFrame, TrackingConfig
 from birdslam.vehicles.tracking import Tracker
+from tests.boxes import CAR, car_px
 from tests.test_frontend import CAMERA, ScriptedOdometry, frame, motion
 
-CAR = DIMENSIONS["car"]
 STEP = SE2(0.8, 0.0, 0.01)  # of the ego, a frame of 0.1 s
 PERIOD_NS = 100_000_000
 FRAMES = 25
@@ -51,11 +50,8 @@ def detections(k: int, noise_px: float = 0.0, seed: int = 0, heights_m: tuple[fl
     rng = np.random.default_rng([seed, k])
     boxes = []
     for pose, height_m in zip(cars(k), heights_m, strict=True):
-        half = [(sl * CAR.length_m / 2, sw * CAR.width_m / 2) for sl in (-1, 1) for sw in (-1, 1)]
-        on_road = EGO[k].between(pose) @ np.array(half)
-        corners = np.vstack([np.column_stack([on_road, np.full(4, z)]) for z in (0.0, height_m)])
-        px = bev.ego_to_pixel(CAMERA, CAMERA.ground, corners)
-        boxes.append([*px.min(axis=0), *px.max(axis=0)] + noise_px * rng.standard_normal(4))
+        box = car_px(EGO[k].between(pose), height_m, CAMERA.ground)
+        boxes.append(box + noise_px * rng.standard_normal(4))
     return Detections(np.array(boxes), np.full(3, 0.9), ("car",) * 3)
 
 

@@ -8,31 +8,25 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from birdslam.geometry import bev
 from birdslam.geometry.se2 import SE2
 from birdslam.vehicles.placement.depth_fusion import PseudoLidarConfig
-from birdslam.vehicles.placement.localisation import DIMENSIONS, LocalisationConfig, Observation, observe_boxes
+from birdslam.vehicles.placement.localisation import LocalisationConfig, Observation, observe_boxes
 from birdslam.vehicles.placement.uncertain_yaw import HeadingConfig
 from birdslam.vehicles.placing import Assignment, Placing, truncate_at_cut
 from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
 from birdslam.vehicles.state.ground_size_filter import Depths, GroundSizeFilter
 from birdslam.vehicles.state.parallax_config import ParallaxConfig
+from tests.boxes import CAR, cuboid_px, footprint_m
 from tests.test_frontend import CAMERA
 
-CAR = DIMENSIONS["car"]
 CONFIG = LocalisationConfig()
 
 
 def seen_at(x_m: float, y_m: float, height_m: float = CAR.height_m) -> Observation:
     """A car headed like the ego, as a detector draws what the image shows of it."""
-    half = [(sl * CAR.length_m / 2, sw * CAR.width_m / 2) for sl in (-1, 1) for sw in (-1, 1)]
-    on_road = np.maximum(
-        np.array(half) + np.array([x_m, y_m]), [0.5, -99.0]
-    )  # what is behind the camera is not in the image
-    corners = np.vstack([np.column_stack([on_road, np.full(4, z)]) for z in (0.0, height_m)])
-    px = bev.ego_to_pixel(CAMERA, CAMERA.ground, corners)
-    low, high = np.zeros(2), np.array([CAMERA.width_px - 1.0, CAMERA.height_px - 1.0])
-    box = np.array([*np.clip(px.min(axis=0), low, high), *np.clip(px.max(axis=0), low, high)])
+    on_road = np.maximum(footprint_m(SE2(x_m, y_m)), [0.5, -99.0])  # what is behind the camera is not in the image
+    border = np.tile([CAMERA.width_px - 1.0, CAMERA.height_px - 1.0], 2)
+    box = np.clip(cuboid_px(on_road, height_m, CAMERA.ground), 0.0, border)
     (found,) = observe_boxes(box[None], np.ones(1), ("car",), CAMERA, CAMERA.ground, CONFIG)
     return found
 

@@ -11,7 +11,6 @@ from msgspec.structs import replace
 
 from birdslam.bench.ego.trajectory_errors import rms
 from birdslam.frontend import FrontEnd, FrontEndConfig
-from birdslam.geometry import bev
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.graph_config import GraphConfig
@@ -19,12 +18,11 @@ from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.perception import Detections, Perception, Ready
 from birdslam.types import Measurements, Status, VehicleEdge
-from birdslam.vehicles.placement.localisation import DIMENSIONS
 from birdslam.vehicles.rts_smoother import RtsSmoother, SmootherConfig, VehicleMeasurement, smooth_vehicle
+from tests.boxes import CAR, car_px
 from tests.cases import first
 from tests.test_frontend import CAMERA, ScriptedOdometry, frame, motion
 
-CAR = DIMENSIONS["car"]
 CONFIG = SmootherConfig()
 FRAMES = 40
 STEP = SE2(1.0, 0.0, 0.0)  # of the ego, a frame of 0.1 s
@@ -35,13 +33,6 @@ def oncoming(k: int) -> SE2:
     return SE2(95.0 - 0.9 * k, 4.0, math.pi)
 
 
-def box_px(at: SE2, height_m: float) -> list[float]:
-    half = [(sl * CAR.length_m / 2, sw * CAR.width_m / 2) for sl in (-1, 1) for sw in (-1, 1)]
-    corners = np.vstack([np.column_stack([at @ np.array(half), np.full(4, z)]) for z in (0.0, height_m)])
-    px = bev.ego_to_pixel(CAMERA, CAMERA.ground, corners)
-    return [*px.min(axis=0), *px.max(axis=0)]
-
-
 def log_of(seed: int, parked_height_m: float, oncoming_height_m: float) -> list[Measurements]:
     """The front end's, of a car parked beside the road and of one that comes, with half a pixel of noise."""
     rng = np.random.default_rng(seed)
@@ -50,7 +41,7 @@ def log_of(seed: int, parked_height_m: float, oncoming_height_m: float) -> list[
     for k in range(FRAMES):
         ego = SE2(float(k), 0.0, 0.0)
         boxes = [
-            box_px(ego.between(car), height_m)
+            car_px(ego.between(car), height_m, CAMERA.ground)
             for car, height_m in ((PARKED, parked_height_m), (oncoming(k), oncoming_height_m))
             if ego.between(car).x_m > 8.0
         ]

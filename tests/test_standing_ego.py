@@ -7,17 +7,17 @@ import pytest
 
 from birdslam.bench.tracking.localisation import measure
 from birdslam.frontend import FrontEndConfig
-from birdslam.geometry import bev
-from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.geometry.camera import GroundPlane
+from birdslam.geometry.se2 import SE2
 from birdslam.perception import Detections
 from birdslam.sources.kitti_tracking import TrackingSequence
-from birdslam.vehicles.placement.localisation import DIMENSIONS, LocalisationConfig, extent_m, observe_boxes
+from birdslam.vehicles.placement.localisation import LocalisationConfig, extent_m, observe_boxes
 from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
 from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
 from birdslam.vehicles.state.parallax import LearnedSize
+from tests.boxes import CAR, car_px
+from tests.recordings import KITTI as CAMERA
 
-CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
-CAR = DIMENSIONS["car"]
 LOCALISATION = LocalisationConfig()
 CONFIG = GroundSizeConfig(roof_reach_rel=1.0)  # the world here is made of cuboids
 PERIOD_S = 0.1
@@ -25,10 +25,7 @@ CARS_M = [(14.0, -4.0), (20.0, 0.0), (26.0, 4.0), (32.0, -4.0)]  # (x, y) of the
 
 
 def box_px(x_m: float, y_m: float, height_m: float, pitch_rad: float) -> np.ndarray:
-    half = [(sl * CAR.length_m / 2, sw * CAR.width_m / 2) for sl in (-1, 1) for sw in (-1, 1)]
-    corners = np.array([(x_m + x, y_m + y, z) for x, y in half for z in (0.0, height_m)])
-    px = bev.ego_to_pixel(CAMERA, GroundPlane(CAMERA.height_m, pitch_rad), corners)
-    return np.array([*px.min(axis=0), *px.max(axis=0)])
+    return car_px(SE2(x_m, y_m), height_m, GroundPlane(CAMERA.height_m, pitch_rad))
 
 
 def see(

@@ -6,8 +6,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from birdslam.geometry import bev
-from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2, wrap
 from birdslam.vehicles.association import predict_boxes_px
 from birdslam.vehicles.placement.depth_fusion import DepthPlace
@@ -16,20 +14,18 @@ from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
 from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
 from birdslam.vehicles.track import EgoFrame, Track, TrackingConfig
 from birdslam.vehicles.tracking import Tracker
+from tests.boxes import cuboid_px, footprint_m
+from tests.recordings import KITTI as CAMERA
 
-CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
-GROUND = GroundPlane(1.65)
+SIZE_M = 4.0, 1.7
 PERIOD_NS = 100_000_000
 
 
 def box_px(T_ego_vehicle: SE2, height_m: float = 1.5) -> np.ndarray | None:
-    footprint = np.array([(sx * 2.0, sy * 0.85) for sx in (-1, 1) for sy in (-1, 1)])
-    on_road = T_ego_vehicle @ footprint
+    on_road = footprint_m(T_ego_vehicle, *SIZE_M)
     if on_road[:, 0].min() < 3.0:
         return None
-    corners = np.vstack([np.column_stack([on_road, np.full(4, z)]) for z in (0.0, height_m)])
-    px = bev.ego_to_pixel(CAMERA, GROUND, corners)
-    box = np.array([*px.min(axis=0), *px.max(axis=0)])
+    box = cuboid_px(on_road, height_m)
     return box if box[0] > 0 and box[2] < CAMERA.width_px and box[3] < CAMERA.height_px else None
 
 
@@ -360,9 +356,7 @@ def test_truncated_car_is_predicted_to_reach_the_border(left: float) -> None:
     tracks = [track for k in range(12) for track in drive.step(SE2(0.8 * k, 0.0), [SE2(16.0, 3.0 * left)])]
     track = tracks[-1]
     ego = SE2(float(track.pose().x_m) - 4.5, 0.0)
-    footprint = np.array([(sx * 2.0, sy * 0.85) for sx in (-1, 1) for sy in (-1, 1)])
-    corners = np.vstack([np.column_stack([ego.between(track.pose()) @ footprint, np.full(4, z)]) for z in (0.0, 1.5)])
-    px = bev.ego_to_pixel(CAMERA, drive.ground_size.ground, corners)
-    true = np.clip([*px.min(axis=0), *px.max(axis=0)], 0.0, [1242.0, 375.0, 1242.0, 375.0])
+    box = cuboid_px(footprint_m(ego.between(track.pose()), *SIZE_M), 1.5, drive.ground_size.ground)
+    true = np.clip(box, 0.0, [1242.0, 375.0, 1242.0, 375.0])
     (predicted,) = predict_boxes_px([track], CAMERA, ego, drive.ground_size.ground)
     assert iou(predicted[None], true[None])[0, 0] > 0.8

@@ -8,29 +8,22 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from birdslam.geometry import bev
-from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
-from birdslam.vehicles.placement.localisation import DIMENSIONS, LocalisationConfig, observe_boxes
+from birdslam.vehicles.placement.localisation import LocalisationConfig, observe_boxes
 from birdslam.vehicles.placement.uncertain_yaw import HeadingConfig, evaluate_yaws
 from birdslam.vehicles.state.yaw_by_outline import YawByOutline
+from tests.boxes import CAR, cuboid_px, footprint_m
+from tests.recordings import KITTI as CAMERA
 
-CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
-CAR, CONFIG, LOCALISATION = DIMENSIONS["car"], HeadingConfig(), LocalisationConfig()
+CONFIG, LOCALISATION = HeadingConfig(), LocalisationConfig()
 SIGMA_DEPTH = 0.05
 
 
 def look(outline: YawByOutline, T_world_ego: SE2, centre_m: tuple[float, float], yaw_rad: float, scale: float) -> None:
     """One frame, in which the car in row 0 is seen; `scale` of its outline lasts."""
     T_ego_car = T_world_ego.between(SE2(*centre_m, yaw_rad))
-    half = [(sl * CAR.length_m / 2, sw * CAR.width_m / 2) for sl in (-1, 1) for sw in (-1, 1)]
-    corners = T_ego_car @ (np.array(half) * scale)
-    px = bev.ego_to_pixel(
-        CAMERA, CAMERA.ground, np.vstack([np.column_stack([corners, np.full(4, z)]) for z in (0.0, CAR.height_m)])
-    )
-    (seen,) = observe_boxes(
-        np.array([[*px.min(axis=0), *px.max(axis=0)]]), np.ones(1), ("car",), CAMERA, CAMERA.ground, LOCALISATION
-    )
+    corners = footprint_m(T_ego_car, scale * CAR.length_m, scale * CAR.width_m)
+    (seen,) = observe_boxes(cuboid_px(corners)[None], np.ones(1), ("car",), CAMERA, CAMERA.ground, LOCALISATION)
     depth: NDArray[np.float64] = np.array([math.log(corners[:, 0].min())])
     outline.predict(0.1, T_world_ego)
     fan = evaluate_yaws([seen], depth, (outline.grid_rad - T_world_ego.yaw_rad)[None], LOCALISATION.reach_rel)
