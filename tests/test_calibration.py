@@ -162,7 +162,7 @@ def _board(turn: tuple[float, float, float], at_m: tuple[float, float, float]) -
 def boards(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("boards")
     rng = np.random.default_rng(4)
-    for k in range(9):
+    for k in range(7):
         turn = (*rng.uniform(-0.5, 0.5, 2), float(rng.uniform(-0.2, 0.2)))
         at = (*rng.uniform(-0.06, 0.06, 2), float(rng.uniform(0.35, 0.5)))
         cv2.imwrite(str(folder / f"{k}.png"), _board(turn, at))
@@ -197,7 +197,7 @@ def test_a_bad_chessboard_is_named(boards: Path, tmp_path: Path) -> None:
         from_chessboard(boards, 2, 0, SQUARE_M)
     flat = tmp_path / "flat"
     flat.mkdir()
-    for k in range(7):
+    for k in range(6):
         cv2.imwrite(str(flat / f"{k}.png"), _board((0.0, 0.0, 0.01 * k), (0.01 * k, 0.0, 0.4)))
     with pytest.raises(DatasetError, match="tilt the board more"):
         from_chessboard(flat, COLUMNS, ROWS, SQUARE_M)

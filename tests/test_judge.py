@@ -52,7 +52,7 @@ def judged(estimates: list[Estimate]) -> Judge:
 
 
 def test_each_pixel_of_the_street_is_the_mean_of_what_it_covers() -> None:
-    texture = street.Texture(3)
+    texture = street.texture(5)
     y, x = np.linspace(-700.25, 3000.5, 301), np.linspace(17.3, 2100.1, 201)  # over several turns, off the grid
     parts = texture.mean(y[:-1], y[1:], x[:-1], x[1:])
     whole = texture.mean(*(np.array([edge]) for edge in (y[0], y[-1], x[0], x[-1])))

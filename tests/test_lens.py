@@ -71,7 +71,9 @@ def test_turning_drive_determines_focal_length_and_distortion(k1: float) -> None
 
 
 def test_straight_drive_determines_only_distortion() -> None:
-    lens = calibrated(drive(-0.3, 0.0))
+    images = drive(-0.3, 0.0)
+    lens = calibrated(images)
+    assert lens == calibrated(images)  # deterministic
     assert not lens.focal_shown
     assert (lens.focal_px, lens.focal_sigma_rel) == (pytest.approx(FOCAL_PX), 0.15)
     assert lens.turned_rad < math.radians(15.0)
@@ -80,9 +82,7 @@ def test_straight_drive_determines_only_distortion() -> None:
 
 @pytest.mark.parametrize("pitch_rad", first(1, [-0.06, 0.05]))
 def test_direction_of_travel_determines_pitch(pitch_rad: float) -> None:
-    images = drive(-0.2, math.radians(40.0), images=40, pitch_rad=pitch_rad)
-    lens = calibrated(images, 1.1 * FOCAL_PX)
-    assert lens == calibrated(images, 1.1 * FOCAL_PX)  # deterministic
+    lens = calibrated(drive(-0.2, math.radians(40.0), images=40, pitch_rad=pitch_rad), 1.1 * FOCAL_PX)
     assert lens.pitch is not None
     assert abs(lens.pitch.pitch_rad - pitch_rad) < 3.0 * lens.pitch.sigma_rad
     assert lens.pitch.sigma_rad < 0.015

@@ -60,6 +60,9 @@ class Texture:
         return rows
 
 
+texture = functools.cache(Texture)  # by the seed
+
+
 def _place(at: Floats) -> tuple[Floats, Ints, Floats]:
     """The number of whole tiles, the texel in the tile, and the fraction of that texel."""
     turns, at = np.divmod(at, TEXELS)
@@ -74,13 +77,13 @@ def street_loop() -> NDArray[np.uint8]:
     out = np.full((LOOP_FRAMES, HEIGHT_PX, WIDTH_PX), SKY, dtype=np.uint8)
     driven_m = np.arange(LOOP_FRAMES, dtype=np.float64) * FRAME_M
 
-    def draw(rows: Any, columns: Any, texture: Texture, depth_m: list[float], across_m: list[Floats]) -> None:
+    def draw(rows: Any, columns: Any, surface: Texture, depth_m: list[float], across_m: list[Floats]) -> None:
         """Draws pixels of one depth in all frames; `depth_m` and `across_m` are the edges of each pixel's footprint."""
         y, x = (TEXELS_PER_M * (at_m + driven_m) for at_m in depth_m), (TEXELS_PER_M * at_m for at_m in across_m)
-        shade = texture.mean(*y, *x)
+        shade = surface.mean(*y, *x)
         out[:, rows, columns] = np.clip(shade + 0.5, 0.0, 255.0).astype(np.uint8)
 
-    road, fronts = Texture(5), Texture(7)
+    road, fronts = texture(5), texture(7)
     for row in np.flatnonzero(v_px > 1.0):
         below_px = v_px[row]
         m_per_px = HEIGHT_M / below_px
