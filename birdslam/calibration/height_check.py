@@ -91,14 +91,27 @@ def checks_by_vehicles(
     config: VehicleHeightConfig,
     known_height_m: float | None = None,
 ) -> list[HeightCheck]:
-    """One check, or none with too few vehicles; `cov` (2, 2) of pitch and roll.
+    """Checks from the vehicles of each class, with enough of them, and from the one of known size.
 
-    `known_height_m` is the stated height of the vehicle with the most boxes, which then is the only one.
+    `cov` (2, 2) of pitch and roll; `known_height_m` is the stated height of the vehicle with the most boxes.
     """
-    cue = VEHICLES
+    out = []
     if known_height_m is not None and boxes:
-        cue, boxes = KNOWN_VEHICLE, _boxes_of_known(boxes, known_height_m)
-        config = msgspec.structs.replace(config, sigma_class_rel=_KNOWN_SIGMA_REL, min_vehicles=1, gate_sigma=math.inf)
+        known, _ = Counter(box.vehicle for box in boxes).most_common(1)[0]
+        of_known = [
+            replace(box, height_m=known_height_m, sigma_height_rel=_MIN_SIGMA_REL)
+            for box in boxes
+            if box.vehicle == known
+        ]
+        boxes = [box for box in boxes if box.vehicle != known]
+        alone = msgspec.structs.replace(config, sigma_class_rel=_KNOWN_SIGMA_REL, min_vehicles=1, gate_sigma=math.inf)
+        out += _check_by_vehicles(KNOWN_VEHICLE, of_known, camera, cov, alone)
+    return out + _check_by_vehicles(VEHICLES, boxes, camera, cov, config)
+
+
+def _check_by_vehicles(
+    cue: str, boxes: Sequence[BoxHeight], camera: Camera, cov: Floats, config: VehicleHeightConfig
+) -> list[HeightCheck]:
     prior = np.array([camera.height_m, camera.pitch_rad, camera.roll_rad])
     prior_cov = np.zeros((3, 3))
     prior_cov[0, 0] = (0.5 * camera.height_m) ** 2
@@ -108,12 +121,6 @@ def checks_by_vehicles(
         return []
     sigma_m = float(np.sqrt(mounting.cov[0, 0]))
     return [HeightCheck(cue=cue, height_m=float(mounting.state[0]), sigma_m=sigma_m, samples=mounting.vehicles)]
-
-
-def _boxes_of_known(boxes: Sequence[BoxHeight], height_m: float) -> list[BoxHeight]:
-    """Boxes of the vehicle that has most of them, with its stated height."""
-    known, _ = Counter(box.vehicle for box in boxes).most_common(1)[0]
-    return [replace(box, height_m=height_m, sigma_height_rel=_MIN_SIGMA_REL) for box in boxes if box.vehicle == known]
 
 
 def solve_mounting(
