@@ -203,7 +203,7 @@ class LineFilter:
         for _ in range(ITERATIONS):
             curves, tilt = state[COMMON:-1].reshape(count, 4), Tilt(float(state[-1]), float(state[VERTICAL]))
             x, y = tilt.applied(points.x_m, points.y_m, height_m)
-            by_ray = _ray_derivatives(x, y, curves, _ray_slopes(x, height_m, tilt.vertical_per_m))
+            by_ray = _ray_derivatives(x, curves, _ray_slopes(x, height_m, tilt.vertical_per_m))
             sigma = np.hypot(points.sigma_m[:, None], by_ray * points.sigma_ray_rad[:, None])
             owner = self._assign_points(x, y, points, sigma, curves, of, classes)
             measures_tilt = (classes == 0) | level
@@ -251,12 +251,13 @@ def _ray_slopes(x_m: Floats, height_m: float, vertical_per_m: float) -> Floats:
     return out
 
 
-def _ray_derivatives(x: Floats, y: Floats, curves: Floats, fall: Floats) -> Floats:
+def _ray_derivatives(x: Floats, curves: Floats, fall: Floats) -> Floats:
     """(N, n) lateral shift of points against each curve per unit of the slope of their rays.
 
-    `fall` (N,) is the slope between the rays and the road.
+    `fall` (N,) is the slope between the rays and the road. The points are taken on the curves: with their measured y
+    the derivative is correlated with the residual, which biases the pitch.
     """
-    out: Floats = ((slope_basis(x) @ curves.T) * x[:, None] - y[:, None]) / fall[:, None]
+    out: Floats = ((slope_basis(x) * x[:, None] - basis(x)) @ curves.T) / fall[:, None]
     return out
 
 
