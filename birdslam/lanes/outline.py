@@ -13,12 +13,10 @@ import numpy as np
 from birdslam.geometry import bev
 from birdslam.geometry.arrays import Bools, Floats
 from birdslam.geometry.camera import Camera, GroundPlane
-from birdslam.perception import Segmentation
 from birdslam.types import Lane, LaneLine
 
 FROM_M, STEP_M = 1.0, 0.5  # first point and spacing of an outline
 _FAR_PX = 20_000.0  # limit of coordinates for OpenCV's drawing
-_CLOSE_PX = 9  # size of mask gaps that are closed: borders to paint, and noise
 
 
 def line_px(
@@ -46,14 +44,6 @@ def lane_mask(camera: Camera, ground: GroundPlane, lane: Lane) -> Bools:
     if len(outline) > 2:
         cv2.fillPoly(mask, [np.round(outline).astype(np.int32)], 1)
     return mask > 0
-
-
-def visible_part(area: Bools, segmentation: Segmentation) -> Bools:
-    """(H, W) part of an area of the road that no vehicle or kerb covers."""
-    road = (segmentation.road | segmentation.lane).view(np.uint8)
-    closed = cv2.morphologyEx(road, cv2.MORPH_CLOSE, np.ones((_CLOSE_PX, _CLOSE_PX), np.uint8)) > 0
-    out: Bools = area & closed
-    return out
 
 
 def _distances_m(ground: GroundPlane, from_m: float, to_m: float, vertical_per_m: float) -> Floats:

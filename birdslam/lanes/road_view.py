@@ -96,10 +96,7 @@ def road_view(
         excess = np.asarray(0.5 * (green + red) - blue, np.float32)
     else:
         grey = seen(image, cv2.INTER_LINEAR)
-    covered = np.zeros(segmentation.road.shape, np.uint8)  # by boxes; road visible in their corners is not hidden
-    for x1, y1, x2, y2 in boxes_px:
-        covered[max(0, int(y1)) : max(0, int(np.ceil(y2))), max(0, int(x1)) : max(0, int(np.ceil(x2)))] = 1
-    covered &= ~(segmentation.road | segmentation.lane)
+    covered = covered_by(boxes_px, segmentation)
     road, paint, hidden = (
         seen(mask.view(np.uint8), cv2.INTER_NEAREST) > 0 for mask in (segmentation.road, segmentation.lane, covered)
     )
@@ -117,6 +114,14 @@ def road_view(
         outside,
         excess,
     )
+
+
+def covered_by(boxes_px: Floats, segmentation: Segmentation) -> Bools:
+    """(H, W) what vehicles cover: their boxes (B, 4) without the road that is visible in the corners."""
+    out = np.zeros(segmentation.road.shape, bool)
+    for x1, y1, x2, y2 in boxes_px:
+        out[max(0, int(y1)) : max(0, int(np.ceil(y2))), max(0, int(x1)) : max(0, int(np.ceil(x2)))] = True
+    return out & ~(segmentation.road | segmentation.lane)
 
 
 def nearest_visible_m(camera: Camera, ground: GroundPlane, bonnet_px: Floats | None) -> float:

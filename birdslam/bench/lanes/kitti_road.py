@@ -19,7 +19,8 @@ from birdslam.geometry import bev
 from birdslam.geometry.arrays import Bools, Floats, Ints
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.lanes.line_tracker import find_lines_in_image
-from birdslam.lanes.outline import lane_mask, line_px, visible_part
+from birdslam.lanes.outline import lane_mask, line_px
+from birdslam.lanes.road_view import covered_by
 from birdslam.lanes.topology import LaneRow, lane_row
 from birdslam.perception import Segmentation
 from birdslam.sources.recording import DatasetError
@@ -124,7 +125,7 @@ def find_lane(camera: Camera, image: NDArray[np.uint8], segmentation: Segmentati
     row = lane_row(lines)
     area = np.zeros(image.shape[:2], dtype=bool)
     if row.ego is not None:
-        area = visible_part(lane_mask(camera, ground, row.lanes[row.ego]), segmentation)
+        area = lane_mask(camera, ground, row.lanes[row.ego]) & ~covered_by(boxes_px, segmentation)
     return Still(lines, row, ground, area)
 
 
