@@ -16,11 +16,13 @@ from numpy.typing import NDArray
 from birdslam.geometry.arrays import Floats, Ints
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
+from birdslam.lanes.borders import border_points
 from birdslam.lanes.curves import basis
-from birdslam.lanes.line_filter import LineFilter, Support, Tilt
+from birdslam.lanes.line_filter import VERTICAL, LineFilter, Support, Tilt
 from birdslam.lanes.paint import LinePoints, double_line_share, edge_points, paint_points
 from birdslam.lanes.parallel_search import MAX_SEARCH_M, Peak, Shape, find_lines, find_shape
 from birdslam.lanes.road_view import RoadView, nearest_visible_m, road_view
+from birdslam.lanes.topology import AT_M, MAX_LANE_TO_EDGE_M
 from birdslam.lanes.tracked_lines import LEFT_EDGE, PAINT, RIGHT_EDGE, Track, TrackedLines, existence_of
 from birdslam.perception import Segmentation
 from birdslam.types import LaneLine
@@ -155,20 +157,42 @@ class LineTracker:
         left, right = edge_points(view, np.zeros(len(view.x_m)))
         edges = (replace(edge, weight=EDGE_WEIGHT_RATIO * edge.weight) for edge in (left, right))
         shape = find_shape(_join(paint, *edges), self._height_m, sigma_tilt_rad)
-        found: list[tuple[int, Peak]] = []
         if shape is None:
-            return None, found
+            return None, []
         curve = np.array([0.0, shape.heading, shape.curvature_per_m, 0.0])
-        for kind, points, min_m, most in (
-            (PAINT, paint, MIN_PAINT_M, MAX_LINES - 2),
-            (LEFT_EDGE, left, MIN_EDGE_M, 1),
-            (RIGHT_EDGE, right, MIN_EDGE_M, 1),
-        ):
-            turned = points.tilted(self._height_m, shape.tilt_rad)
-            found += [(kind, peak) for peak in find_lines(turned, curve, min_m, MIN_SPACING_M, most)]
-            if kind == PAINT and found:  # paint gives the heading more precisely than a mask
-                curve[1] = np.average([p.heading for _, p in found], weights=[p.evidence_m for _, p in found])
+        found = self._find(PAINT, paint, shape, curve)
+        if found:  # paint gives the heading more precisely than a mask
+            curve[1] = np.average([p.heading for _, p in found], weights=[p.evidence_m for _, p in found])
+            lines = np.tile(curve, (len(found), 1))
+            lines[:, 0], lines[:, 1] = np.array([(p.offset_m, p.heading) for _, p in found]).T
+            left, right = self._borders(view, lines, Tilt(shape.tilt_rad), left, right)
+        found += self._find(LEFT_EDGE, left, shape, curve) + self._find(RIGHT_EDGE, right, shape, curve)
         return shape, found
+
+    def _find(self, kind: int, points: LinePoints, shape: Shape, curve: Floats) -> list[tuple[int, Peak]]:
+        min_m, most = (MIN_PAINT_M, MAX_LINES - 2) if kind == PAINT else (MIN_EDGE_M, 1)
+        turned = points.tilted(self._height_m, shape.tilt_rad)
+        return [(kind, peak) for peak in find_lines(turned, curve, min_m, MIN_SPACING_M, most)]
+
+    def _borders(
+        self, view: RoadView, paint: Floats, tilt: Tilt, left: LinePoints, right: LinePoints
+    ) -> tuple[LinePoints, LinePoints]:
+        """The edges' points; where the ego's lane has `paint` (n, 4) on one side only, those of its other border."""
+        y_m = paint @ basis(np.array([AT_M]))[0]
+        near = sorted(np.flatnonzero(np.abs(y_m) < MAX_LANE_TO_EDGE_M), key=lambda k: abs(y_m[k]))
+        at_left = next((k for k in near if y_m[k] > 0.0), None)
+        at_right = next((k for k in near if y_m[k] <= 0.0), None)
+        if at_left is not None and (at_right is None or y_m[at_left] - y_m[at_right] > MAX_LANE_TO_EDGE_M):
+            right = border_points(view, *self._in_rows(view, paint[at_left], tilt), -1, right)
+        if at_right is not None and (at_left is None or y_m[at_left] - y_m[at_right] > MAX_LANE_TO_EDGE_M):
+            left = border_points(view, *self._in_rows(view, paint[at_right], tilt), 1, left)
+        return left, right
+
+    def _in_rows(self, view: RoadView, curve: Floats, tilt: Tilt) -> tuple[Floats, Floats]:
+        """A line's y in each row of the view, and metres of the view per metre of the road."""
+        on_road_m, _ = tilt.applied(view.x_m, np.zeros(len(view.x_m)), self._height_m)
+        stretch = view.x_m / on_road_m
+        return (basis(on_road_m) @ curve) * stretch, stretch
 
     def _restart_filter(self, shape: Shape | None, found: list[tuple[int, Peak]]) -> float:
         """Restarts the filter with these lines; returns their tilt."""
@@ -194,7 +218,7 @@ class LineTracker:
         level: bool,
     ) -> tuple[LinePoints, Ints, list[Support]]:
         """Corrects the filter by one image. Returns its points, their classes and the support of each line."""
-        points, of = self._with_edges(view, paint)
+        points, of = self._with_edges(view, paint, Tilt(first_tilt_rad, float(self._filter.common[VERTICAL])))
         classes = np.array([track.kind for track in self._tracks])
         seen, self.tilt = self._filter.update(
             points, of, classes, self._height_m, sigma_pitch_rad, travelled_m, first_tilt_rad, level
@@ -214,11 +238,13 @@ class LineTracker:
         in_view_m = [view.row_m[there & self._project_line(view, k)[1]].sum() for k in painted]
         return not painted or max(in_view_m) > IN_VIEW_M
 
-    def _with_edges(self, view: RoadView, paint: LinePoints) -> tuple[LinePoints, Ints]:
+    def _with_edges(self, view: RoadView, paint: LinePoints, tilt: Tilt) -> tuple[LinePoints, Ints]:
         """All points of the image, and the class of each; edges are looked for from the way ahead."""
         shape = self._filter.curves[self._reference()].copy()
         shape[0] = 0.0
         left, right = edge_points(view, basis(view.x_m) @ shape)
+        painted = self._filter.curves[[track.kind == PAINT for track in self._tracks]]
+        left, right = self._borders(view, painted, tilt, left, right)
         of = np.repeat([PAINT, LEFT_EDGE, RIGHT_EDGE], [len(paint), len(left), len(right)])
         return _join(paint, left, right), of
 
@@ -234,7 +260,7 @@ class LineTracker:
             column, clear = self._project_line(view, k)
             visible_m = float(view.row_m[clear & (x > NEAR_M) & (x < FAR_M)].sum())
             mine = points.of(support.points)
-            if track.kind != PAINT:
+            if track.kind != PAINT and _length_m(mine) < MIN_EDGE_M:
                 side = 1 if track.kind == LEFT_EDGE else -1
                 past = np.clip(column + side * round(PAST_EDGE_M / (view.y_m[1] - view.y_m[0])), 0, len(view.y_m) - 1)
                 looked = clear & (x > NEAR_M) & (x < FAR_M) & ~view.outside[rows, past] & ~view.hidden[rows, past]
@@ -275,8 +301,7 @@ class LineTracker:
     def _project_line(self, view: RoadView, k: int) -> tuple[Ints, NDArray[np.bool_]]:
         """Returns the line's column in each row of the view, and whether it is visible there."""
         x = view.x_m
-        on_road_m, _ = self.tilt.applied(x, np.zeros(len(x)), self._height_m)
-        y = (basis(on_road_m) @ self._filter.curves[k]) * x / on_road_m
+        y, _ = self._in_rows(view, self._filter.curves[k], self.tilt)
         column = np.round((y - view.y_m[0]) / (view.y_m[1] - view.y_m[0])).astype(np.int64)
         inside = (column >= 0) & (column < len(view.y_m))
         at, rows = np.clip(column, 0, len(view.y_m) - 1), np.arange(len(x))

@@ -18,13 +18,13 @@ from birdslam.types import Bound, Lane, LaneLine, LineKind
 
 AT_M = 8.0  # distance at which lanes are compared: in view of most cameras and precise
 MIN_LANE_M, MAX_LANE_M = 2.3, 4.2
-MAX_LANE_TO_EDGE_M = 5.5  # of a lane that ends at the road's edge, parked cars included
+MAX_LANE_TO_EDGE_M = 4.6  # of a lane that ends at the road's edge
 MIN_STRIP_M = 0.8  # a hard shoulder or a cycle lane
 NO_LANE_COST = 0.6  # of a strip that is not a lane
 WIDE_COST = 0.4  # of a lane wider than MAX_LANE_M
 PAINT_AT_EDGE_M = 0.6  # a painted line closer to an edge replaces it
 MIN_KERB_M = 0.1  # min. distance of a kerbstone past the edge, since a mask's border is imprecise
-WIDTH_M, WIDTH_SIGMA_M = 3.4, 0.4  # default lane width
+WIDTH_M, WIDTH_SIGMA_M = 3.3, 0.5  # prior of lane widths: 2.75 to 3.75 m by road standards, and wider ones
 MIN_END_WIDTH_M = 1.9  # a lane ends where it is narrower
 STEP_M, MIN_END_SIGMAS = 2.0, 2.0  # step and confidence of the search for a lane's end
 
