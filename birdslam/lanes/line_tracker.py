@@ -180,12 +180,13 @@ class LineTracker:
         """The edges' points; where the ego's lane has `paint` (n, 4) on one side only, those of its other border."""
         y_m = paint @ basis(np.array([AT_M]))[0]
         near = sorted(np.flatnonzero(np.abs(y_m) < MAX_LANE_TO_EDGE_M), key=lambda k: abs(y_m[k]))
-        at_left = next((k for k in near if y_m[k] > 0.0), None)
-        at_right = next((k for k in near if y_m[k] <= 0.0), None)
-        if at_left is not None and (at_right is None or y_m[at_left] - y_m[at_right] > MAX_LANE_TO_EDGE_M):
-            right = border_points(view, *self._in_rows(view, paint[at_left], tilt), -1, right)
-        if at_right is not None and (at_left is None or y_m[at_left] - y_m[at_right] > MAX_LANE_TO_EDGE_M):
-            left = border_points(view, *self._in_rows(view, paint[at_right], tilt), 1, left)
+        bounds = [next((k for k in near if side * y_m[k] > 0.0), None) for side in (1, -1)]
+        if None not in bounds and abs(y_m[bounds[0]] - y_m[bounds[1]]) < MAX_LANE_TO_EDGE_M:
+            return left, right
+        if near and near[0] == bounds[0]:  # of two that are too far apart the nearer is the ego's
+            right = border_points(view, *self._in_rows(view, paint[near[0]], tilt), -1, right)
+        elif near:
+            left = border_points(view, *self._in_rows(view, paint[near[0]], tilt), 1, left)
         return left, right
 
     def _in_rows(self, view: RoadView, curve: Floats, tilt: Tilt) -> tuple[Floats, Floats]:

@@ -19,11 +19,10 @@ from birdslam.types import Bound, Lane, LaneLine, LineKind
 AT_M = 8.0  # distance at which lanes are compared: in view of most cameras and precise
 MIN_LANE_M, MAX_LANE_M = 2.3, 4.2
 MAX_LANE_TO_EDGE_M = 4.6  # of a lane that ends at the road's edge
-MIN_STRIP_M = 0.8  # a hard shoulder or a cycle lane
+MIN_STRIP_M = 0.8  # a hard shoulder or a cycle lane; a painted line closer to an edge replaces it
 NO_LANE_COST = 0.6  # of a strip that is not a lane
 WIDE_COST = 0.4  # of a lane wider than MAX_LANE_M
-PAINT_AT_EDGE_M = 0.6  # a painted line closer to an edge replaces it
-MIN_KERB_M = 0.1  # min. distance of a kerbstone past the edge, since a mask's border is imprecise
+MIN_KERB_M, MAX_KERB_M = 0.1, 0.6  # distance of a kerbstone past the edge, since a mask's border is imprecise
 WIDTH_M, WIDTH_SIGMA_M = 3.3, 0.5  # prior of lane widths: 2.75 to 3.75 m by road standards, and wider ones
 MIN_END_WIDTH_M = 1.9  # a lane ends where it is narrower
 STEP_M, MIN_END_SIGMAS = 2.0, 2.0  # step and confidence of the search for a lane's end
@@ -65,7 +64,7 @@ def _select_bounds(lines: tuple[LaneLine, ...]) -> list[LaneLine]:
     usable = paint + [
         line
         for line in lines
-        if line.kind is LineKind.EDGE and all(abs(line.y_m(AT_M) - p.y_m(AT_M)) > PAINT_AT_EDGE_M for p in paint)
+        if line.kind is LineKind.EDGE and all(abs(line.y_m(AT_M) - p.y_m(AT_M)) > MIN_STRIP_M for p in paint)
     ]
     usable.sort(key=lambda line: -line.y_m(AT_M))
     best: list[tuple[float, list[LaneLine]]] = []
@@ -83,7 +82,7 @@ def _select_bounds(lines: tuple[LaneLine, ...]) -> list[LaneLine]:
 def _is_kerb(line: LaneLine, edge: LaneLine) -> bool:
     """Whether a bright line is a kerbstone: it lies just past the road's edge, paint lies before it."""
     past_m = (line.y_m(AT_M) - edge.y_m(AT_M)) * math.copysign(1.0, edge.y_m(AT_M))
-    return MIN_KERB_M < past_m < PAINT_AT_EDGE_M
+    return MIN_KERB_M < past_m < MAX_KERB_M
 
 
 def _strip_cost(left: LaneLine, right: LaneLine) -> float:
