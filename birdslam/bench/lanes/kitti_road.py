@@ -131,16 +131,21 @@ def find_lane(camera: Camera, image: NDArray[np.uint8], segmentation: Segmentati
 
 def score(name: str, camera: Camera, still: Still, mask: NDArray[np.uint8]) -> StillScore:
     """The lane against its mask (H, W, 3)."""
-    truth, counted = (mask == LANE).all(axis=2), (mask != IGNORED).any(axis=2)
-    cells = grid_px(camera)
     lane = None if still.row.ego is None else still.row.lanes[still.row.ego]
     return StillScore(
         image=name,
-        ego_lane_iou=iou(still.area[cells], truth[cells], counted[cells]),
+        ego_lane_iou=iou_of(camera, still, mask),
         width_m=None if lane is None else lane.width_m,
         left=None if lane is None else lane.left_bound,
         right=None if lane is None else lane.right_bound,
     )
+
+
+def iou_of(camera: Camera, still: Still, mask: NDArray[np.uint8]) -> float:
+    """IoU of the lane with its mask (H, W, 3) in bird's-eye view."""
+    truth, counted = (mask == LANE).all(axis=2), (mask != IGNORED).any(axis=2)
+    cells = grid_px(camera)
+    return iou(still.area[cells], truth[cells], counted[cells])
 
 
 def grid_px(camera: Camera) -> tuple[Ints, Ints]:

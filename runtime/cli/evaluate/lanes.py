@@ -5,14 +5,18 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from birdslam.bench.figures import number
 from birdslam.bench.lanes.paint_masks import PaintReport
+from birdslam.bench.lanes.true_borders import LOW_IOU, START_S, BordersReport
 from birdslam.runtime.cli.arguments import add_config, add_pipeline
+from birdslam.runtime.configuration import ConfigurationError
+from birdslam.runtime.evaluation.border_lanes import evaluate_borders
 from birdslam.runtime.evaluation.drive_lanes import DriveReport, evaluate_drive
 from birdslam.runtime.evaluation.lanes import draw_frame_lanes
 from birdslam.runtime.evaluation.still_lanes import REPORT, evaluate_paint, evaluate_stills
 from birdslam.runtime.options import configuration_of
 
-KITTI_ROAD, LINES, PAINT = "kitti-road", "lines", "paint"
+BORDERS, KITTI_ROAD, LINES, PAINT = "borders", "kitti-road", "lines", "paint"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -23,7 +27,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = "kitti-road: DIR has single images image_N.png with masks ego_lane_N.png of the ego lane; "
     text += "lines: DRIVE is a rendered drive with true lines, demo:DIR; "
     text += "paint: DIR has imgs/NAME.png and masks/NAME.png of lane markings, as in comma10k"
-    parser.add_argument("--truth", choices=(KITTI_ROAD, LINES, PAINT), help=text)
+    text += "; borders: DRIVE has true poses, and --borders has the borders of its lane"
+    parser.add_argument("--truth", choices=(BORDERS, KITTI_ROAD, LINES, PAINT), help=text)
+    text = "left and right border of the ego lane: distance travelled and left offset, metres (JSON)"
+    parser.add_argument("--borders", type=Path, metavar="FILE", help=text)
     add_config(parser)
     add_pipeline(parser)
 
@@ -31,6 +38,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Draws the lanes and prints the file name, or prints the scores against the truth."""
     configuration = configuration_of(options)
+    if (options.truth == BORDERS) != (options.borders is not None):
+        raise ConfigurationError("--borders FILE belongs to --truth borders")
+    if options.truth == BORDERS:
+        print(_borders_text(evaluate_borders(configuration, options.drive, options.borders)))
+        return 0
     if options.truth == LINES:
         print(_text(evaluate_drive(configuration, options.drive)))
         return 0
@@ -47,6 +59,21 @@ def run(options: argparse.Namespace) -> int:
     print(f"{report.images} images: mean IoU of the ego lane {report.ego_lane_iou_mean:.3f}")
     print(Path(configuration.output) / REPORT)
     return 0
+
+
+def _borders_text(report: BordersReport) -> str:
+    out = [
+        f"{report.drive}: {report.images} single images: mean IoU of the ego lane {number(report.iou_mean, 3)}, "
+        f"{number(report.iou_low)} below {LOW_IOU}",
+        f"  {report.frames} frames after {START_S:g} s: ego lane in {number(report.with_lane)}, "
+        f"false in {number(report.false)} of these",
+    ]
+    out += [
+        f"  {at.ahead_m:4.0f} m ahead: error of the bounds {number(at.error_median_m)} m median, "
+        f"{number(at.error_p95_m)} m p95, centre within 2 sigma {number(at.within_2_sigma)}, {at.frames} frames"
+        for at in report.ranges
+    ]
+    return "\n".join(out)
 
 
 def _paint_text(report: PaintReport) -> str:

@@ -1,0 +1,60 @@
+"""Compares the ego lane of a real drive with its traced borders, in single images and with the line tracker."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from birdslam.bench.lanes.kitti_road import find_lane, iou_of
+from birdslam.bench.lanes.true_borders import START_S, BorderScores, BordersReport, TrueBorders, read_borders
+from birdslam.lanes.road_view import covered_by
+from birdslam.outputs.drive_files import claim_directory, write_json
+from birdslam.runtime.configuration import Configuration, ConfigurationError, complete
+from birdslam.runtime.nodes.inference import Inference
+from birdslam.runtime.nodes.sources import RecordedSource, offline_frames, open_recorded, recording_uri
+from birdslam.runtime.progress import Progress
+from birdslam.slam import BirdSLAM
+
+IMAGE_STEP = 10  # every n-th image is searched for its lane on its own
+MIN_AHEAD_M = 33.0  # known borders ahead of a frame that counts
+
+
+def evaluate_borders(configuration: Configuration, drive: str, file: Path) -> BordersReport:
+    """Processes a drive with true poses and compares its lanes with the borders; writes report.json to the output.
+
+    Raises ConfigurationError, DatasetError, ModelError, ResultsError.
+    """
+    configuration = configuration.as_lossless()
+    recording = open_recorded(recording_uri(drive), configuration.camera, configuration.source.stride)
+    truth = TrueBorders(recording, read_borders(file))
+    output = Path(configuration.output)
+    claim_directory(output)
+    source = RecordedSource(recording, configuration.source)
+    scores = BorderScores()
+    camera = recording.camera
+    with (
+        Inference(complete(configuration, camera, source.rate_hz)) as inference,
+        Progress(recording.name, len(recording)) as progress,
+    ):
+        slam = BirdSLAM(camera, inference.networks, configuration.slam, lane_head=inference.lane_head)
+        frames = list(offline_frames(source))
+        for frame in frames:
+            _, estimate = slam.step(frame)
+            progress.advance()
+            if frame.frame_id >= START_S * recording.rate_hz and truth.covers(frame.frame_id, MIN_AHEAD_M):
+                scores.add(estimate.lanes, *truth.borders_m(frame.frame_id))
+    with Inference(complete(configuration, camera, source.rate_hz)) as inference:
+        for frame in frames[::IMAGE_STEP]:
+            if frame.image is None or not truth.covers(frame.frame_id, MIN_AHEAD_M):
+                continue
+            perception = inference.networks.start(0, frame.image).result()  # always frame 0: nothing is carried over
+            if perception.segmentation is None:
+                raise ConfigurationError("--model: no network segments road and lanes")
+            boxes = np.zeros((0, 4)) if perception.detections is None else perception.detections.boxes_px
+            still = find_lane(camera, frame.image, perception.segmentation, boxes)
+            mask = truth.mask(frame.frame_id, covered_by(boxes, perception.segmentation))
+            scores.ious.append(iou_of(camera, still, mask))
+    report = scores.report(recording.name)
+    write_json(output / "report.json", report)
+    return report
