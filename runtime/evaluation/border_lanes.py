@@ -48,7 +48,7 @@ def evaluate_borders(configuration: Configuration, drive: str, file: Path) -> Bo
         for frame in frames[::IMAGE_STEP]:
             if frame.image is None or not truth.covers(frame.frame_id, MIN_AHEAD_M):
                 continue
-            perception = inference.networks.start(0, frame.image).result()  # always frame 0: nothing is carried over
+            perception = inference.networks.start(0, frame.image).result()  # always frame 0: no result is carried over
             if perception.segmentation is None:
                 raise ConfigurationError("--model: no network segments road and lanes")
             boxes = np.zeros((0, 4)) if perception.detections is None else perception.detections.boxes_px

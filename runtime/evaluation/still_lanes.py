@@ -6,8 +6,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
+from birdslam.bench.lanes import line_masks
 from birdslam.bench.lanes.kitti_road import (
+    Still,
     StillsReport,
     camera_of,
     draw,
@@ -19,6 +22,7 @@ from birdslam.bench.lanes.kitti_road import (
 )
 from birdslam.bench.lanes.paint_masks import PaintReport, find_images, read, score_paint
 from birdslam.bench.lanes.paint_masks import report_of as paint_report
+from birdslam.geometry.camera import Camera
 from birdslam.outputs.drive_files import ResultsError, claim_directory, write_json
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.nodes.inference import Inference
@@ -75,16 +79,50 @@ def evaluate_stills(configuration: Configuration, folder: Path) -> StillsReport:
                 camera = camera_of(image, configuration.camera)
             except DatasetError as error:
                 raise DatasetError(f"{pair.image}: {error}") from None
-            perception = inference.networks.start(0, image).result()  # always frame 0: no result is carried over
-            if perception.segmentation is None:
-                raise ConfigurationError("--model: no network segments road and lanes")
-            boxes = np.zeros((0, 4)) if perception.detections is None else perception.detections.boxes_px
-            still = find_lane(camera, image, perception.segmentation, boxes)
+            still = _find(inference, camera, image)
             scores.append(score(pair.image.name, camera, still, mask))
-            picture = output / f"lanes_{pair.number}.png"
-            if not cv2.imwrite(str(picture), draw(image, camera, still)):
-                raise ResultsError(f"{picture}: can't be written")
+            _write_picture(output, pair.number, draw(image, camera, still))
             progress.advance()
     report = report_of(scores, tuple(head.name for head in heads))
     write_json(output / REPORT, report)
     return report
+
+
+def evaluate_line_masks(configuration: Configuration, folder: Path) -> line_masks.LineMasksReport:
+    """Scores the painted lines in all images of a folder independently; writes the report and a picture of each.
+
+    The camera is that of the configuration or an assumed one. Raises ConfigurationError, DatasetError, ModelError,
+    ResultsError.
+    """
+    pairs = line_masks.find_images(folder)
+    output = Path(configuration.output)
+    claim_directory(output)
+    configuration = configuration.as_lossless()
+    scores = []
+    with Inference(configuration) as inference, Progress(folder.name, len(pairs)) as progress:
+        for number, (image_path, mask_path) in enumerate(pairs):
+            image, mask = read(image_path), read(mask_path)
+            if image.shape != mask.shape:
+                raise DatasetError(f"{mask_path}: differs in size from its image")
+            camera = configuration.camera or line_masks.camera_of(image)
+            still = _find(inference, camera, image)
+            scores.append(line_masks.score_lines(image_path.name, camera, still, mask))
+            _write_picture(output, number, draw(image, camera, still))
+            progress.advance()
+    report = line_masks.report_of(scores)
+    write_json(output / REPORT, report)
+    return report
+
+
+def _find(inference: Inference, camera: Camera, image: NDArray[np.uint8]) -> Still:
+    perception = inference.networks.start(0, image).result()  # always frame 0: no result is carried over
+    if perception.segmentation is None:
+        raise ConfigurationError("--model: no network segments road and lanes")
+    boxes = np.zeros((0, 4)) if perception.detections is None else perception.detections.boxes_px
+    return find_lane(camera, image, perception.segmentation, boxes)
+
+
+def _write_picture(output: Path, number: int, picture: NDArray[np.uint8]) -> None:
+    path = output / f"lanes_{number}.png"
+    if not cv2.imwrite(str(path), picture):
+        raise ResultsError(f"{path}: can't be written")

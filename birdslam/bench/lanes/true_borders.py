@@ -6,6 +6,7 @@ frames. The road is the camera's height below the trajectory, which includes pit
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -29,10 +30,14 @@ _SHIFT = 4  # fractional bits of cv2.fillPoly
 
 
 class Borders(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Distance travelled and left offset, metres, of points on the left and the right border of the ego's lane."""
+    """Distance travelled and left offset, metres, of points on the left and the right border of the ego's lane.
+
+    `yaw_rad` turns the camera of the poses to the right, until images of the same road from near and from far agree.
+    """
 
     left: list[tuple[float, float]]
     right: list[tuple[float, float]]
+    yaw_rad: float = 0.0
 
 
 class BorderRange(msgspec.Struct, frozen=True, kw_only=True):
@@ -80,7 +85,9 @@ class TrueBorders:
         self._camera = recording.camera
         T = np.tile(np.eye(4), (len(rows), 1, 1))
         T[:, :3] = rows
-        self._T_world_cam: Floats = T @ recording.T_cam0_cam()
+        sin, cos = math.sin(borders.yaw_rad), math.cos(borders.yaw_rad)
+        turn = np.array([[cos, 0.0, sin, 0.0], [0.0, 1.0, 0.0, 0.0], [-sin, 0.0, cos, 0.0], [0.0, 0.0, 0.0, 1.0]])
+        self._T_world_cam: Floats = T @ recording.T_cam0_cam() @ turn
         at = self._T_world_cam[:, :3, 3]
         kept = [0]
         for k in range(1, len(at)):

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from birdslam.bench.figures import number
+from birdslam.bench.lanes.line_masks import LineMasksReport
 from birdslam.bench.lanes.paint_masks import PaintReport
 from birdslam.bench.lanes.true_borders import LOW_IOU, START_S, BordersReport
 from birdslam.runtime.cli.arguments import add_config, add_pipeline
@@ -13,10 +14,10 @@ from birdslam.runtime.configuration import ConfigurationError
 from birdslam.runtime.evaluation.border_lanes import evaluate_borders
 from birdslam.runtime.evaluation.drive_lanes import DriveReport, evaluate_drive
 from birdslam.runtime.evaluation.lanes import draw_frame_lanes
-from birdslam.runtime.evaluation.still_lanes import REPORT, evaluate_paint, evaluate_stills
+from birdslam.runtime.evaluation.still_lanes import REPORT, evaluate_line_masks, evaluate_paint, evaluate_stills
 from birdslam.runtime.options import configuration_of
 
-BORDERS, KITTI_ROAD, LINES, PAINT = "borders", "kitti-road", "lines", "paint"
+BORDERS, KITTI_ROAD, LINES, LINE_MASKS, PAINT = "borders", "kitti-road", "lines", "line-masks", "paint"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -27,8 +28,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = "kitti-road: DIR has single images image_N.png with masks ego_lane_N.png of the ego lane; "
     text += "lines: DRIVE is a rendered drive with true lines, demo:DIR; "
     text += "paint: DIR has imgs/NAME.png and masks/NAME.png of lane markings, as in comma10k"
+    text += "; line-masks: DIR has image_N.jpg with masks lines_N.png, as TuSimple"
     text += "; borders: DRIVE has true poses, and --borders has the borders of its lane"
-    parser.add_argument("--truth", choices=(BORDERS, KITTI_ROAD, LINES, PAINT), help=text)
+    parser.add_argument("--truth", choices=(BORDERS, KITTI_ROAD, LINES, LINE_MASKS, PAINT), help=text)
     text = "left and right border of the ego lane: distance travelled and left offset, metres (JSON)"
     parser.add_argument("--borders", type=Path, metavar="FILE", help=text)
     add_config(parser)
@@ -45,6 +47,9 @@ def run(options: argparse.Namespace) -> int:
         return 0
     if options.truth == LINES:
         print(_text(evaluate_drive(configuration, options.drive)))
+        return 0
+    if options.truth == LINE_MASKS:
+        print(_line_masks_text(evaluate_line_masks(configuration, Path(options.drive))))
         return 0
     if options.truth == PAINT:
         print(_paint_text(evaluate_paint(configuration, Path(options.drive))))
@@ -73,6 +78,16 @@ def _borders_text(report: BordersReport) -> str:
         f"{number(at.error_p95_m)} m p95, centre within 2 sigma {number(at.within_2_sigma)}, {at.frames} frames"
         for at in report.ranges
     ]
+    return "\n".join(out)
+
+
+def _line_masks_text(report: LineMasksReport) -> str:
+    out = [
+        f"{found.image:16} {found.right} of {found.true} lines, {found.found} found, "
+        f"mean error {number(found.error_px, 1)} px"
+        for found in report.by_image
+    ]
+    out.append(f"{report.images} images: F1 at 20 px {report.f1:.2f}, mean error {number(report.error_px, 1)} px")
     return "\n".join(out)
 
 
