@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from birdslam.geometry.arrays import Bools, Floats
-from birdslam.lanes.paint import MAX_ROW_M, LinePoints
+from birdslam.lanes.paint import LinePoints, border_at
 from birdslam.lanes.road_view import LATTICE_M, RoadView
 from birdslam.lanes.topology import WIDTH_M, WIDTH_SIGMA_M
 
@@ -59,16 +59,7 @@ def border_points(view: RoadView, bound_m: Floats, stretch: Floats, side: int, m
     window = np.clip(np.arange(best - skip // 2, best + skip // 2 + 1), 0, len(WIDTHS_M) - 1)
     peak = window[np.argmax(vote[:, window], axis=1)]
     index = np.flatnonzero(vote[np.arange(len(vote)), peak] > MIN_VOTE_SIGMAS)
-    kept = index, peak[index]
-    return LinePoints(
-        view.x_m[index],
-        y_m[kept],
-        np.hypot(SIGMA_BORDER_M, SIGMA_BORDER_PX * view.sigma_y_m[index]),
-        np.minimum(view.row_m[index], MAX_ROW_M),
-        np.ones(len(index), bool),
-        np.full(len(index), np.nan),
-        np.full(len(index), SIGMA_BORDER_PX * view.pixel_rad),
-    )
+    return border_at(view, index, y_m[index, peak[index]], SIGMA_BORDER_M, SIGMA_BORDER_PX)
 
 
 def _step_votes(values: Floats, seen: Bools) -> Floats:

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.geometry.arrays import Floats, Ints
+from birdslam.geometry.arrays import Bools, Floats, Ints
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.lanes.borders import border_points
@@ -21,7 +21,7 @@ from birdslam.lanes.curves import basis
 from birdslam.lanes.line_filter import VERTICAL, LineFilter, Support, Tilt
 from birdslam.lanes.paint import LinePoints, double_line_share, edge_points, paint_points
 from birdslam.lanes.parallel_search import MAX_SEARCH_M, Peak, Shape, find_lines, find_shape
-from birdslam.lanes.road_view import RoadView, nearest_visible_m, road_view
+from birdslam.lanes.road_view import LATTICE_M, RoadView, nearest_visible_m, road_view
 from birdslam.lanes.topology import AT_M, MAX_LANE_TO_EDGE_M
 from birdslam.lanes.tracked_lines import LEFT_EDGE, PAINT, RIGHT_EDGE, Track, TrackedLines, existence_of
 from birdslam.perception import Segmentation
@@ -42,7 +42,6 @@ MIN_END_M = -2.0  # end of a line behind the ego at which it is dropped
 NEAR_M, FAR_M = 5.0, 25.0  # range in which a line is tested
 # Lines closer than MIN_LANE_WIDTH_M bound no lane: the score of one without paint decreases faster by this factor
 MIN_LANE_WIDTH_M, CONTESTED_COST_RATIO = 1.5, 3.0
-PAST_EDGE_M, MAX_ROAD_PAST_RATIO = 0.8, 0.35  # distance past an edge, max. share of road there
 MIN_EXISTENCE, MIN_IMAGES = 0.4, 4.0  # a line with a lower existence after MIN_IMAGES is dropped
 RESTART_M = 10.0  # distance travelled assumed for the first image
 # The lines are lost if they explain less than LOST_RATIO of the paint, and a new search BETTER_RATIO times as much
@@ -236,7 +235,7 @@ class LineTracker:
             return False
         there = (view.x_m > NEAR_M) & (view.x_m < MAX_SEARCH_M)
         painted = [k for k, track in enumerate(self._tracks) if track.kind == PAINT]
-        in_view_m = [view.row_m[there & self._project_line(view, k)[1]].sum() for k in painted]
+        in_view_m = [view.row_m[there & self._visible_rows(view, k)].sum() for k in painted]
         return not painted or max(in_view_m) > IN_VIEW_M
 
     def _with_edges(self, view: RoadView, paint: LinePoints, tilt: Tilt) -> tuple[LinePoints, Ints]:
@@ -257,19 +256,10 @@ class LineTracker:
         """Updates the scores of the lines, their ranges and their share of paint."""
         contested = self._find_contested(points, seen)
         for k, (track, support) in enumerate(zip(self._tracks, seen, strict=True)):
-            x, rows = view.x_m, np.arange(len(view.x_m))
-            column, clear = self._project_line(view, k)
+            x = view.x_m
+            clear = self._visible_rows(view, k)
             visible_m = float(view.row_m[clear & (x > NEAR_M) & (x < FAR_M)].sum())
             mine = points.of(support.points)
-            if track.kind != PAINT and _length_m(mine) < MIN_EDGE_M:
-                side = 1 if track.kind == LEFT_EDGE else -1
-                past = np.clip(column + side * round(PAST_EDGE_M / (view.y_m[1] - view.y_m[0])), 0, len(view.y_m) - 1)
-                looked = clear & (x > NEAR_M) & (x < FAR_M) & ~view.outside[rows, past] & ~view.hidden[rows, past]
-                if view.row_m[looked & view.road[rows, past]].sum() > MAX_ROAD_PAST_RATIO * max(
-                    view.row_m[looked].sum(), 1.0
-                ):
-                    track.score -= 1.0
-                    continue
             support_m = _length_m(mine)
             track.evidence_m += support_m
             if support_m >= MIN_SEEN_PAINT_M:
@@ -299,14 +289,13 @@ class LineTracker:
             elif track.kind != PAINT:
                 track.looks += 1.0
 
-    def _project_line(self, view: RoadView, k: int) -> tuple[Ints, NDArray[np.bool_]]:
-        """Returns the line's column in each row of the view, and whether it is visible there."""
-        x = view.x_m
-        y, _ = self._in_rows(view, self._filter.curves[k], self.tilt)
-        column = np.round((y - view.y_m[0]) / (view.y_m[1] - view.y_m[0])).astype(np.int64)
-        inside = (column >= 0) & (column < len(view.y_m))
-        at, rows = np.clip(column, 0, len(view.y_m) - 1), np.arange(len(x))
-        return column, inside & ~view.outside[rows, at] & ~view.hidden[rows, at]
+    def _visible_rows(self, view: RoadView, k: int) -> Bools:
+        """(R,) whether a line is visible in each row of the view."""
+        y_m, _ = self._in_rows(view, self._filter.curves[k], self.tilt)
+        column = np.round((y_m - view.y_m[0]) / LATTICE_M).astype(np.int64)
+        rows, at = np.arange(len(y_m)), np.clip(column, 0, len(view.y_m) - 1)
+        out: Bools = (column == at) & ~view.outside[rows, at] & ~view.hidden[rows, at]
+        return out
 
     def _find_contested(self, points: LinePoints, seen: list[Support]) -> set[int]:
         """Returns the lines near a confirmed, visible painted line: lines of one road neither meet nor cross."""

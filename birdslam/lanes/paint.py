@@ -19,10 +19,7 @@ from birdslam.lanes.road_view import LATTICE_M, RoadView
 STEP_FILTER_M = 0.28  # from a line's middle to the asphalt beside it; lines are up to 0.3 m wide
 MIN_RIDGE_SPACING_M = 0.3  # between two ridges
 MAX_LINE_WIDTH_M = 0.45  # wider paint (plus blur) is an arrow, a letter or a crossing's bar; lines are up to 0.3 m wide
-MIN_HEAD_WIDTH_M, MIN_HEAD_RATIO = (
-    0.25,
-    1.4,
-)  # width of an arrow's head, absolute and over its mean; a line has a constant width
+MIN_HEAD_WIDTH_M, MIN_HEAD_RATIO = 0.25, 1.4  # width of an arrow's head, absolute and over its mean
 MAX_CRACK_M = 0.2  # darker stripes up to this width are filled before paint is segmented
 MAX_SYMBOL_LENGTH_M = 9.0  # longer paint is a line even if it touches a symbol
 SYMBOL_CONTRAST_RATIO = 0.5  # of the contrast of the brightest paint: kerbstones are paler
@@ -154,9 +151,8 @@ def _symbols(view: RoadView, response: Floats32, usable: Bools, min_response: fl
         return out
     contrast = max(min_response, SYMBOL_CONTRAST_RATIO * float(np.quantile(strong, 0.9)))
     band = np.ones((1, round(MAX_BAND_M / LATTICE_M) | 1), np.uint8)
-    crack = np.ones(
-        (1, round(MAX_CRACK_M / LATTICE_M) | 1), np.uint8
-    )  # asphalt between two cracks looks like a bright band
+    # Asphalt between two cracks looks like a bright band
+    crack = np.ones((1, round(MAX_CRACK_M / LATTICE_M) | 1), np.uint8)
     asphalt = cv2.morphologyEx(cv2.morphologyEx(view.grey, cv2.MORPH_CLOSE, crack), cv2.MORPH_OPEN, band)
     bright = usable & (view.grey - asphalt > contrast)
     count, labels, boxes, _ = cv2.connectedComponentsWithStats(bright.view(np.uint8), connectivity=8)
@@ -260,43 +256,30 @@ def edge_points(view: RoadView, middle_m: Floats) -> tuple[LinePoints, LinePoint
     gap = round(MAX_MASK_GAP_M / LATTICE_M) | 1
     closed = cv2.morphologyEx((view.road | view.paint).view(np.uint8), cv2.MORPH_CLOSE, np.ones((3, gap), np.uint8))
     free = (closed > 0) & ~view.outside
-    start = np.clip(np.searchsorted(view.y_m, middle_m), 0, len(view.y_m) - 1)
-    count = len(view.y_m)
+    count, rows = len(view.y_m), np.arange(len(view.x_m))
+    start = np.clip(np.searchsorted(view.y_m, middle_m), 0, count - 1)
     index = np.arange(count, dtype=np.int32)
+    beyond = np.arange(round(0.5 / LATTICE_M))  # a vehicle that covers these may cover the border
     out = []
-    on = free[np.arange(len(start)), start]
     for side in (1, -1):
-        stops = ~free & ((index > start[:, None]) if side > 0 else (index < start[:, None]))
-        ordered = stops if side > 0 else stops[:, ::-1]
-        first = ordered.argmax(axis=1)  # steps to the first cell off the road
-        first = first if side > 0 else count - 1 - first
-        at = np.where(stops.any(axis=1), np.abs(first - start), count)
-        column = start + side * at
-        inside = on & (column >= 0) & (column < count) & (at < count)
-        past = np.clip(column, 0, count - 1)
-        rows = np.arange(len(start))
-        seen = inside & ~view.outside[rows, past] & ~_is_hidden_beyond(view.hidden, rows, past, side)
-        kept = np.flatnonzero(seen)
-        y_m = view.y_m[past[kept]] - 0.5 * side * LATTICE_M
-        sigma = np.hypot(SIGMA_EDGE_M, SIGMA_EDGE_PX * view.sigma_y_m[kept])
-        nothing = np.full(len(kept), np.nan)
-        out.append(
-            LinePoints(
-                view.x_m[kept],
-                y_m,
-                sigma,
-                np.minimum(view.row_m[kept], MAX_ROW_M),
-                np.ones(len(kept), bool),
-                nothing,
-                np.full(len(kept), SIGMA_EDGE_PX * view.pixel_rad),
-            )
-        )
+        stops = ~free & (side * index > side * start[:, None])
+        at = stops.argmax(axis=1) if side > 0 else count - 1 - stops[:, ::-1].argmax(axis=1)
+        past = np.clip(at[:, None] + side * beyond, 0, count - 1)
+        kept = free[rows, start] & stops.any(axis=1) & ~view.outside[rows, at]
+        kept &= ~view.hidden[rows[:, None], past].any(axis=1)
+        y_m = view.y_m[at] - 0.5 * side * LATTICE_M
+        out.append(border_at(view, np.flatnonzero(kept), y_m[kept], SIGMA_EDGE_M, SIGMA_EDGE_PX))
     return out[0], out[1]
 
 
-def _is_hidden_beyond(hidden: Bools, rows: Ints, columns: Ints, side: int) -> Bools:
-    """Whether a vehicle covers the road within half a metre beyond."""
-    reach = round(0.5 / LATTICE_M)
-    steps = np.clip(columns[:, None] + side * np.arange(reach), 0, hidden.shape[1] - 1)
-    out: Bools = hidden[rows[:, None], steps].any(axis=1)
-    return out
+def border_at(view: RoadView, rows: Ints, y_m: Floats, sigma_m: float, sigma_px: float) -> LinePoints:
+    """Points of a border at `y_m` in these rows, whose 1-sigma has a part in metres and one in pixels."""
+    return LinePoints(
+        view.x_m[rows],
+        y_m,
+        np.hypot(sigma_m, sigma_px * view.sigma_y_m[rows]),
+        np.minimum(view.row_m[rows], MAX_ROW_M),
+        np.ones(len(rows), bool),
+        np.full(len(rows), np.nan),
+        np.full(len(rows), sigma_px * view.pixel_rad),
+    )

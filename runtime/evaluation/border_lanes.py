@@ -6,9 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from birdslam.bench.lanes.kitti_road import find_lane, iou_of
 from birdslam.bench.lanes.true_borders import START_S, BorderScores, BordersReport, TrueBorders, read_borders
-from birdslam.lanes.road_view import covered_by
 from birdslam.outputs.drive_files import claim_directory, write_json
 from birdslam.runtime.configuration import Configuration, ConfigurationError, complete
 from birdslam.runtime.nodes.inference import Inference
@@ -52,9 +50,7 @@ def evaluate_borders(configuration: Configuration, drive: str, file: Path) -> Bo
             if perception.segmentation is None:
                 raise ConfigurationError("--model: no network segments road and lanes")
             boxes = np.zeros((0, 4)) if perception.detections is None else perception.detections.boxes_px
-            still = find_lane(camera, frame.image, perception.segmentation, boxes)
-            mask = truth.mask(frame.frame_id, covered_by(boxes, perception.segmentation))
-            scores.ious.append(iou_of(camera, still, mask))
+            scores.ious.append(truth.image_iou(frame.frame_id, frame.image, perception.segmentation, boxes))
     report = scores.report(recording.name)
     write_json(output / "report.json", report)
     return report

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.bench.figures import mean
+from birdslam.bench.figures import mean, number
 from birdslam.bench.lanes.kitti_road import Still
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
@@ -116,3 +116,13 @@ def report_of(scores: list[LineMaskScore]) -> LineMasksReport:
         error_px=mean([s.error_px for s in scores]),
         by_image=tuple(scores),
     )
+
+
+def text_of(report: LineMasksReport) -> str:
+    """Lines for a terminal."""
+    out = [
+        f"{s.image:16} {s.right} of {s.true} lines, {s.found} found, mean error {number(s.error_px, 1)} px"
+        for s in report.by_image
+    ]
+    out.append(f"{report.images} images: F1 at 20 px {report.f1:.2f}, mean error {number(report.error_px, 1)} px")
+    return "\n".join(out)

@@ -15,10 +15,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.bench.figures import mean, median
-from birdslam.bench.lanes.kitti_road import IGNORED, LANE
+from birdslam.bench.figures import mean, median, number
+from birdslam.bench.lanes.kitti_road import IGNORED, LANE, find_lane, iou_of
 from birdslam.geometry.arrays import Bools, Floats
 from birdslam.geometry.camera import Camera
+from birdslam.lanes.road_view import covered_by
+from birdslam.perception import Segmentation
 from birdslam.sources.recording import DatasetError, Recording
 from birdslam.types import Lanes
 
@@ -26,6 +28,7 @@ RANGES_M = (10.0, 20.0, 30.0)
 MIN_STEP_M, STEP_M, AHEAD_M = 0.5, 0.5, 60.0  # of the trajectory, of a border's points, and how far these go
 START_S = 2.0  # frames before are not counted: the line tracker starts
 FALSE_M = 0.5  # error of a bound at RANGES_M[0] that makes the lane a false one
+LOW_IOU = 0.8
 _SHIFT = 4  # fractional bits of cv2.fillPoly
 
 
@@ -61,9 +64,6 @@ class BordersReport(msgspec.Struct, frozen=True, kw_only=True):
     with_lane: float | None
     false: float | None  # share of the frames with a lane whose bound is off by more than FALSE_M
     ranges: tuple[BorderRange, ...]
-
-
-LOW_IOU = 0.8
 
 
 def read_borders(path: Path) -> Borders:
@@ -128,6 +128,11 @@ class TrueBorders:
         left /= np.linalg.norm(left, axis=1, keepdims=True)
         out: Floats = at + self._camera.height_m * down + left * left_m[:, None]
         return out
+
+    def image_iou(self, frame_id: int, image: NDArray[np.uint8], segmentation: Segmentation, boxes_px: Floats) -> float:
+        """IoU of the lane that is found in this image alone, as in `kitti_road`."""
+        still = find_lane(self._camera, image, segmentation, boxes_px)
+        return iou_of(self._camera, still, self.mask(frame_id, covered_by(boxes_px, segmentation)))
 
     def mask(self, frame_id: int, covered: Bools) -> NDArray[np.uint8]:
         """(H, W, 3) mask as in `kitti_road`; ignored beyond the known borders and where vehicles cover the road."""
@@ -194,3 +199,19 @@ def _range_of(x_m: float, errors: list[tuple[float, float, float]]) -> BorderRan
         error_p95_m=float(np.quantile(bounds, 0.95)) if bounds else None,
         within_2_sigma=mean([sigmas < 2.0 for _, _, sigmas in errors]),
     )
+
+
+def text_of(report: BordersReport) -> str:
+    """Lines for a terminal."""
+    out = [
+        f"{report.drive}: {report.images} single images: mean IoU of the ego lane {number(report.iou_mean, 3)}, "
+        f"{number(report.iou_low)} below {LOW_IOU}",
+        f"  {report.frames} frames after {START_S:g} s: ego lane in {number(report.with_lane)}, "
+        f"false in {number(report.false)} of these",
+    ]
+    out += [
+        f"  {at.ahead_m:4.0f} m ahead: error of the bounds {number(at.error_median_m)} m median, "
+        f"{number(at.error_p95_m)} m p95, centre within 2 sigma {number(at.within_2_sigma)}, {at.frames} frames"
+        for at in report.ranges
+    ]
+    return "\n".join(out)

@@ -5,10 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from birdslam.bench.figures import number
-from birdslam.bench.lanes.line_masks import LineMasksReport
+from birdslam.bench.lanes.line_masks import text_of as line_masks_text
 from birdslam.bench.lanes.paint_masks import PaintReport
-from birdslam.bench.lanes.true_borders import LOW_IOU, START_S, BordersReport
+from birdslam.bench.lanes.true_borders import text_of as borders_text
 from birdslam.runtime.cli.arguments import add_config, add_pipeline
 from birdslam.runtime.configuration import ConfigurationError
 from birdslam.runtime.evaluation.border_lanes import evaluate_borders
@@ -43,13 +42,13 @@ def run(options: argparse.Namespace) -> int:
     if (options.truth == BORDERS) != (options.borders is not None):
         raise ConfigurationError("--borders FILE belongs to --truth borders")
     if options.truth == BORDERS:
-        print(_borders_text(evaluate_borders(configuration, options.drive, options.borders)))
+        print(borders_text(evaluate_borders(configuration, options.drive, options.borders)))
         return 0
     if options.truth == LINES:
         print(_text(evaluate_drive(configuration, options.drive)))
         return 0
     if options.truth == LINE_MASKS:
-        print(_line_masks_text(evaluate_line_masks(configuration, Path(options.drive))))
+        print(line_masks_text(evaluate_line_masks(configuration, Path(options.drive))))
         return 0
     if options.truth == PAINT:
         print(_paint_text(evaluate_paint(configuration, Path(options.drive))))
@@ -64,31 +63,6 @@ def run(options: argparse.Namespace) -> int:
     print(f"{report.images} images: mean IoU of the ego lane {report.ego_lane_iou_mean:.3f}")
     print(Path(configuration.output) / REPORT)
     return 0
-
-
-def _borders_text(report: BordersReport) -> str:
-    out = [
-        f"{report.drive}: {report.images} single images: mean IoU of the ego lane {number(report.iou_mean, 3)}, "
-        f"{number(report.iou_low)} below {LOW_IOU}",
-        f"  {report.frames} frames after {START_S:g} s: ego lane in {number(report.with_lane)}, "
-        f"false in {number(report.false)} of these",
-    ]
-    out += [
-        f"  {at.ahead_m:4.0f} m ahead: error of the bounds {number(at.error_median_m)} m median, "
-        f"{number(at.error_p95_m)} m p95, centre within 2 sigma {number(at.within_2_sigma)}, {at.frames} frames"
-        for at in report.ranges
-    ]
-    return "\n".join(out)
-
-
-def _line_masks_text(report: LineMasksReport) -> str:
-    out = [
-        f"{found.image:16} {found.right} of {found.true} lines, {found.found} found, "
-        f"mean error {number(found.error_px, 1)} px"
-        for found in report.by_image
-    ]
-    out.append(f"{report.images} images: F1 at 20 px {report.f1:.2f}, mean error {number(report.error_px, 1)} px")
-    return "\n".join(out)
 
 
 def _paint_text(report: PaintReport) -> str:
