@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from birdslam.bench.lanes.true_borders import START_S, BorderScores, BordersReport, TrueBorders, read_borders
 from birdslam.outputs.drive_files import claim_directory, write_json
-from birdslam.runtime.configuration import Configuration, ConfigurationError, complete
+from birdslam.runtime.configuration import Configuration, complete
+from birdslam.runtime.evaluation.still_lanes import perceive_still
 from birdslam.runtime.nodes.inference import Inference
 from birdslam.runtime.nodes.sources import RecordedSource, offline_frames, open_recorded, recording_uri
 from birdslam.runtime.progress import Progress
@@ -46,11 +45,7 @@ def evaluate_borders(configuration: Configuration, drive: str, file: Path) -> Bo
         for frame in frames[::IMAGE_STEP]:
             if frame.image is None or not truth.covers(frame.frame_id, MIN_AHEAD_M):
                 continue
-            perception = inference.networks.start(0, frame.image).result()  # always frame 0: no result is carried over
-            if perception.segmentation is None:
-                raise ConfigurationError("--model: no network segments road and lanes")
-            boxes = np.zeros((0, 4)) if perception.detections is None else perception.detections.boxes_px
-            scores.ious.append(truth.image_iou(frame.frame_id, frame.image, perception.segmentation, boxes))
+            scores.ious.append(truth.image_iou(frame.frame_id, frame.image, *perceive_still(inference, frame.image)))
     report = scores.report(recording.name)
     write_json(output / "report.json", report)
     return report

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from birdslam.bench.lanes import line_masks
 from birdslam.bench.lanes.kitti_road import (
-    Still,
     StillsReport,
     camera_of,
     draw,
@@ -22,8 +21,8 @@ from birdslam.bench.lanes.kitti_road import (
 )
 from birdslam.bench.lanes.paint_masks import PaintReport, find_images, read, score_paint
 from birdslam.bench.lanes.paint_masks import report_of as paint_report
-from birdslam.geometry.camera import Camera
 from birdslam.outputs.drive_files import ResultsError, claim_directory, write_json
+from birdslam.perception import Segmentation
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.nodes.inference import Inference
 from birdslam.runtime.progress import Progress
@@ -47,9 +46,7 @@ def evaluate_paint(configuration: Configuration, folder: Path) -> PaintReport:
             image, mask = read(image_path), read(mask_path)
             if image.shape != mask.shape:
                 raise DatasetError(f"{mask_path}: differs in size from its image")
-            segmentation = inference.networks.start(0, image).result().segmentation
-            if segmentation is None:
-                raise ConfigurationError("--model: no network segments road and lanes")
+            segmentation, _ = perceive_still(inference, image)
             scores.append(score_paint(image_path.name, image, segmentation.lane, mask))
             progress.advance()
         own = next((spec for spec in (configuration.models.segmenter,) if spec is not None), None)
@@ -79,7 +76,7 @@ def evaluate_stills(configuration: Configuration, folder: Path) -> StillsReport:
                 camera = camera_of(image, configuration.camera)
             except DatasetError as error:
                 raise DatasetError(f"{pair.image}: {error}") from None
-            still = _find(inference, camera, image)
+            still = find_lane(camera, image, *perceive_still(inference, image))
             scores.append(score(pair.image.name, camera, still, mask))
             _write_picture(output, pair.number, draw(image, camera, still))
             progress.advance()
@@ -105,7 +102,7 @@ def evaluate_line_masks(configuration: Configuration, folder: Path) -> line_mask
             if image.shape != mask.shape:
                 raise DatasetError(f"{mask_path}: differs in size from its image")
             camera = configuration.camera or line_masks.camera_of(image)
-            still = _find(inference, camera, image)
+            still = find_lane(camera, image, *perceive_still(inference, image))
             scores.append(line_masks.score_lines(image_path.name, camera, still, mask))
             _write_picture(output, number, draw(image, camera, still))
             progress.advance()
@@ -114,12 +111,13 @@ def evaluate_line_masks(configuration: Configuration, folder: Path) -> line_mask
     return report
 
 
-def _find(inference: Inference, camera: Camera, image: NDArray[np.uint8]) -> Still:
+def perceive_still(inference: Inference, image: NDArray[np.uint8]) -> tuple[Segmentation, NDArray[np.float64]]:
+    """Segmentation and vehicle boxes (B, 4) of one image. Raises ConfigurationError if no network segments."""
     perception = inference.networks.start(0, image).result()  # always frame 0: no result is carried over
     if perception.segmentation is None:
         raise ConfigurationError("--model: no network segments road and lanes")
-    boxes = np.zeros((0, 4)) if perception.detections is None else perception.detections.boxes_px
-    return find_lane(camera, image, perception.segmentation, boxes)
+    boxes_px = np.zeros((0, 4)) if perception.detections is None else perception.detections.boxes_px
+    return perception.segmentation, boxes_px
 
 
 def _write_picture(output: Path, number: int, picture: NDArray[np.uint8]) -> None:
