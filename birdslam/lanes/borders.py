@@ -23,6 +23,7 @@ MAX_STEP_SIGMAS, MIN_GREY = 3.0, 1.0  # limit of one row's vote; least noise in 
 MAX_MEAN_SIGMAS = 2.5
 STEP_EVIDENCE = 1.5  # log odds per squared mean of the votes
 MASK_EVIDENCE, MASK_SIGMA_M = 1.0, 0.2  # log odds of a mask's border along the whole lane
+MIN_LOG_ODDS = 0.5  # of a border; below, none is seen
 INSIDE_M = 0.32  # steps nearer than this are the same border
 MIN_VOTE_SIGMAS = 0.5  # of a row at the border
 SIGMA_BORDER_M, SIGMA_BORDER_PX = 0.15, 1.5
@@ -32,7 +33,7 @@ def border_points(view: RoadView, bound_m: Floats, stretch: Floats, side: int, m
     """Points of the border at the left (`side` 1) or right (-1) of a lane with a painted bound on the other side.
 
     `bound_m` (R,) is the painted bound in the rows of the view, `stretch` (R,) metres of the view per metre of road.
-    `mask` has the border of the road's mask on that side.
+    `mask` has the border of the road's mask on that side; it is returned where no border is seen.
     """
     y_m = bound_m[:, None] + side * WIDTHS_M * stretch[:, None]
     rows = (view.x_m > NEAR_M) & (view.x_m < FAR_M)
@@ -55,6 +56,8 @@ def border_points(view: RoadView, bound_m: Floats, stretch: Floats, side: int, m
     score += MASK_EVIDENCE * np.minimum(mask.weight[near] @ on_mask / (FAR_M - NEAR_M), 1.0)
     score += np.log(np.exp(-0.5 * ((WIDTHS_M - WIDTH_M) / WIDTH_SIGMA_M) ** 2) + ANY_WIDTH)
     best = int(np.argmax(np.where(WIDTHS_M > MIN_WIDTH_M, score, -np.inf)))
+    if score[best] < MIN_LOG_ODDS:
+        return mask
     vote = votes[plane[best]] * np.sign(means[plane[best]][best])
     window = np.clip(np.arange(best - skip // 2, best + skip // 2 + 1), 0, len(WIDTHS_M) - 1)
     peak = window[np.argmax(vote[:, window], axis=1)]

@@ -19,6 +19,7 @@ from birdslam.types import Bound, Lane, LaneLine, LineKind
 AT_M = 8.0  # distance at which lanes are compared: in view of most cameras and precise
 MIN_LANE_M, MAX_LANE_M = 2.3, 4.2
 MAX_LANE_TO_EDGE_M = 4.6  # of a lane that ends at the road's edge
+MAX_PAINTED_LANE_M = 5.5  # between two painted lines, on ramps and in bends
 MIN_STRIP_M = 0.8  # a hard shoulder or a cycle lane; a painted line closer to an edge replaces it
 NO_LANE_COST = 0.6  # of a strip that is not a lane
 WIDE_COST = 0.4  # of a lane wider than MAX_LANE_M
@@ -105,7 +106,7 @@ def _is_lane(left: LaneLine, right: LaneLine) -> bool:
         return False
     if edges == 2:
         return True
-    return width < MAX_LANE_TO_EDGE_M
+    return width < (MAX_LANE_TO_EDGE_M if edges else MAX_PAINTED_LANE_M)
 
 
 def _curve(line: LaneLine | Lane) -> Floats:
