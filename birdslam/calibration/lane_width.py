@@ -12,9 +12,10 @@ from typing import NamedTuple
 import numpy as np
 
 from birdslam.calibration.height_check import LANES, HeightCheck
-from birdslam.lanes.topology import AT_M, WIDTH_M, WIDTH_SIGMA_M
+from birdslam.lanes.topology import AT_M
 from birdslam.types import Bound, Lanes
 
+WIDTH_M, WIDTH_SIGMA_M = 3.4, 0.4  # of lanes with paint on both sides
 MIN_DISTANCE_M = 20.0  # min. distance under painted lanes: a shorter one may be a turning lane
 _KNOWN_SIGMA_REL = 0.02  # of a stated width: by the side of the paint that it is measured to
 _CORRELATION_M = 30.0  # correlation length of lane widths
