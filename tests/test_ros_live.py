@@ -581,8 +581,8 @@ def test_lost_router_is_reported_and_images_return(tmp_path: Path) -> None:
         stack.callback(source.close)
         assert next(frames).image is not None
         router.close()
-        said = next(frame.error for frame in frames if frame.image is None)
-        assert "no image for" in str(said)
+        # Images that arrive out of order have errors of their own
+        assert any("no image for" in str(frame.error) for frame in frames)
         until(
             lambda: "the router is not connected" in str(next(frames).error), "it does not say that the router is gone"
         )

@@ -198,8 +198,9 @@ class Recorder:
                 self._end_frame = record.frame_id
                 return
             resume = self._assignment.resume
-            if resume is not None and self._estimate_frame < 0:
-                self._missed = max(0, record.frame_id - resume.next_frame)
+            if self._assignment.restarts and self._estimate_frame < 0:
+                # Without a resume point the previous recorder may have written nothing
+                self._missed = max(0, record.frame_id - (0 if resume is None else resume.next_frame))
             self._estimate_frame = record.frame_id
             self._frames += 1
             self._writer.draw("/estimate", record, t_ns)
