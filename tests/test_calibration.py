@@ -34,7 +34,7 @@ from birdslam.lanes.ego_lane import EgoLane
 from birdslam.odometry.road.fit import RoadFit
 from birdslam.outputs.plain_words import DriveCounts, LengthsBy, verdict
 from birdslam.perception import Perception, Ready
-from birdslam.runtime.calibration.given import known_length_of
+from birdslam.runtime.calibration.given import KnownSize, known_length_of
 from birdslam.runtime.calibration.height import check_sigma_rel, lengths_by, with_height
 from birdslam.runtime.cli.main import main
 from birdslam.runtime.configuration import ConfigurationError
@@ -514,9 +514,9 @@ def test_unusable_known_length_is_refused(text: str) -> None:
 
 
 def test_known_lengths_are_of_lanes_or_of_a_vehicle() -> None:
-    assert known_length_of("lane=3.5") == {"lane_m": 3.5}
-    assert known_length_of("car=4.4x1.8x1.45") == {"car_height_m": 1.45}
-    assert known_length_of(None) == {}
+    assert known_length_of("lane=3.5") == KnownSize(lane_m=3.5)
+    assert known_length_of("car=4.4x1.8x1.45") == KnownSize(car_height_m=1.45)
+    assert known_length_of(None) == KnownSize()
 
 
 def test_sigma_of_a_film_includes_readout_time() -> None:

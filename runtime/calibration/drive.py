@@ -88,7 +88,7 @@ def calibrate_drive(
     known_height = height_m is not None or lens is None  # a recording with its own calibration has the height
     cv2.setNumThreads(configuration.perceive.opencv_threads)
     configuration = configuration.as_lossless()
-    config = msgspec.structs.replace(config, known_lane_m=given.lane_m, known_vehicle_m=given.car_height_m)
+    config = msgspec.structs.replace(config, known_lane_m=given.size.lane_m, known_vehicle_m=given.size.car_height_m)
     with Inference(configuration) as inference:
 
         def drive() -> Iterator[tuple[Frame, Pending]]:
@@ -103,9 +103,9 @@ def calibrate_drive(
             if must_show:
                 raise CalibrationError(f"{uri}: {error}") from None
             found = _assumed(recording.camera, pitch, str(error))
-    if given.lane_m is not None and not any(check.cue == LANES for check in found.height_checks):
+    if given.size.lane_m is not None and not any(check.cue == LANES for check in found.height_checks):
         raise CalibrationError(f"{uri}: --known-length lane: less than {MIN_DISTANCE_M:g} m between two painted lines")
-    if given.car_height_m is not None and not any(check.cue == KNOWN_VEHICLE for check in found.height_checks):
+    if given.size.car_height_m is not None and not any(check.cue == KNOWN_VEHICLE for check in found.height_checks):
         raise CalibrationError(f"{uri}: --known-length car: the drive shows no vehicle well enough")
     camera, height_by = with_height(found, known_height, lens, uri, readout)
     return Calibrated(

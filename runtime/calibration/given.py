@@ -24,6 +24,16 @@ from birdslam.sources.recording import DatasetError, Recording
 METADATA_SIGMA_REL = 0.1  # of a focal length from metadata, since videos are often cropped; by judgement
 
 
+class KnownSize(NamedTuple):
+    """What `--known-length` states: the width of lanes, or the height of the vehicle in view for most frames."""
+
+    lane_m: float | None = None
+    car_height_m: float | None = None
+
+
+_NO_SIZE = KnownSize()
+
+
 @dataclass(frozen=True)
 class Given:
     """The user's input about the camera: intrinsics from at most one of the first three, and lengths."""
@@ -37,23 +47,22 @@ class Given:
     fov_deg: float | None = None  # horizontal field of view, for an unknown lens
     kind: str = "dashcam"  # kind of camera, if the field of view is unknown too
     speed: Path | None = None  # lines of time in s, speed in m/s
-    lane_m: float | None = None  # width of the drive's lanes
-    car_height_m: float | None = None  # of the vehicle that is in view for most frames
+    size: KnownSize = _NO_SIZE
 
 
-def known_length_of(text: str | None) -> dict[str, float]:
-    """Parses `--known-length`, `lane=3.5` or `car=4.4x1.8x1.45`, to a field of `Given`. Raises ConfigurationError."""
+def known_length_of(text: str | None) -> KnownSize:
+    """Parses `--known-length`, `lane=3.5` or `car=4.4x1.8x1.45`. Raises ConfigurationError."""
     if text is None:
-        return {}
+        return _NO_SIZE
     what, _, numbers = text.partition("=")
     try:
         sizes_m = [float(number) for number in numbers.split("x")]
     except ValueError:
         sizes_m = []
     if what == "lane" and len(sizes_m) == 1 and 2.0 <= sizes_m[0] <= 6.0:
-        return {"lane_m": sizes_m[0]}
+        return KnownSize(lane_m=sizes_m[0])
     if what == "car" and len(sizes_m) in (1, 3) and 1.0 <= sizes_m[-1] <= 4.5:
-        return {"car_height_m": sizes_m[-1]}
+        return KnownSize(car_height_m=sizes_m[-1])
     raise ConfigurationError(
         f"--known-length {text}: expected lane=METRES, a width of 2 to 6 m, or car=LENGTHxWIDTHxHEIGHT, "
         "a height of 1 to 4.5 m"

@@ -52,7 +52,7 @@ def run(options: argparse.Namespace) -> int:
         fov_deg=options.fov,
         kind=options.kind,
         speed=options.known_speed,
-        **known_length_of(options.known_length),
+        size=known_length_of(options.known_length),
     )
     found = calibrate_drive(configuration_of(options), options.source, given, options.stride or 1)
     write_camera_file(Path(options.output), found.camera, found.report)

@@ -177,7 +177,7 @@ def _calibrated(
         fov_deg=options.fov,
         kind=options.kind,
         speed=speed,
-        **known_length_of(options.known_length),
+        size=known_length_of(options.known_length),
     )
     found = calibrate_drive(configuration, source.uri, given, source.stride, ROUGH, must_show=False)
     path = Path(configuration.output) / "camera.toml"
