@@ -297,7 +297,7 @@ class LaneLine(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     cov: Cov4
     seen_from_m: float  # x of the nearest point that was seen of it, behind the ego < 0
     seen_to_m: float  # x of the farthest point that was seen of it; beyond, up to `to_m`, it is predicted
-    to_m: float  # x up to which it is known to 1.5 m (1-sigma)
+    to_m: float  # x up to which it is known to 0.6 m
     kind: LineKind = LineKind.UNKNOWN
     colour: LineColour = LineColour.UNKNOWN
     existence: Probability = 1.0  # the probability that it is a line

@@ -18,7 +18,7 @@ from birdslam.types import LaneLine, LineColour, LineKind
 PAINT, LEFT_EDGE, RIGHT_EDGE = 0, 1, 2  # classes of lines; points correct only lines of their class
 EVIDENCE_M = 6.0  # paint that gives an existence of 1 - 1 / e
 MAX_RANGE_M = 60.0  # max. prediction range of a line
-MAX_SIGMA_M = 1.5  # max. lateral 1-sigma within the prediction range: half a lane
+MAX_SIGMA_M = 0.6  # max. lateral 1-sigma within the prediction range
 SIGMA_HEIGHT_REL = 0.02  # of the camera's height (mapping.StaticMapConfig)
 SIGMA_OFFSET_M = 0.025  # of the middle of the paint
 MIN_SOLID_RATIO, MAX_DASHED_RATIO = 0.8, 0.6  # painted share of a line: minimum of a solid one, maximum of a dashed one

@@ -22,7 +22,8 @@ from birdslam.types import LineKind
 
 NEAR_PX, MIN_NEAR_RATIO = 20.0, 0.85  # a line is found if so many of its rows are so near (TuSimple)
 ROW_STEP_PX = 10
-# Of TuSimple's images, unknown: focal length as of other dashcams, the horizon and the height by US lanes of 3.66 m
+# TuSimple does not state its camera: focal length of other dashcams, horizon from the true lines of six images, height
+# from US lanes of 3.66 m
 FOCAL_PX, HORIZON_PX, HEIGHT_M = 1000.0, 230.0, 1.6
 
 
