@@ -231,7 +231,7 @@ def test_two_clicks_measure_a_length_on_the_road(results: Path, tmp_path: Path) 
     width_px, height_px = drawn.size_px
     path = report(results, "--video", str(film(results / "film.avi", drawn.size_px)))
     ends_m = np.array([[-1.0, CAMERA.height_m, 6.0], [1.0, CAMERA.height_m, 6.0]])  # across the road, in camera axes
-    ends_px = drawn.scale * CAMERA.to_px(ends_m[:, :2] / ends_m[:, 2:])
+    ends_px = drawn.scale * (CAMERA.to_px(ends_m[:, :2] / ends_m[:, 2:]) + 0.5)
     clicks = CLICKS % json.dumps((ends_px / [width_px, height_px]).tolist())
     path.write_text(path.read_text(encoding="utf-8").replace("</body>", clicks + "</body>"), encoding="utf-8")
     seen = look(path.resolve().as_uri(), tmp_path / "seen.png")

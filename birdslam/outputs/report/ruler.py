@@ -10,7 +10,7 @@ import numpy as np
 from birdslam.geometry.camera import Camera, plane_normal
 from birdslam.outputs.drive_video import SideBySide
 
-_BOUNCE_RAD = 0.008  # 1-sigma of the body's pitch in one image
+_BOUNCE_RAD = 0.008  # 1-sigma of the body's pitch in one image (height_check.py)
 _CLICK_PX = 1.5  # 1-sigma of a click in a picture
 
 
@@ -33,7 +33,7 @@ def ruler(camera_toml: str, video_px: tuple[int, int], picture_px: int) -> dict[
         "scale_px": [side / drawn.scale for side in video_px],
         "size_px": [camera.width_px, camera.height_px],
         "focal_px": [camera.fx_px, camera.fy_px],
-        "centre_px": [camera.cx_px, camera.cy_px],
+        "centre_px": [camera.cx_px + 0.5, camera.cy_px + 0.5],  # from the corner of the image, as clicks are
         "height_m": camera.height_m,
         "normal": normal.tolist(),
         "normal_sigma": (by_pitch * sigma_rad).tolist(),
