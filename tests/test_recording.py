@@ -27,6 +27,7 @@ from birdslam.runtime.configuration import Configuration, ConfigurationError, Re
 from birdslam.runtime.nodes.capture import stamps
 from birdslam.runtime.nodes.recorder import Recorder, about
 from birdslam.runtime.nodes.sources import open_source
+from birdslam.runtime.process.restarts import FIRST, Assignment, Resume
 from birdslam.runtime.process.vitals import Vitals
 from birdslam.runtime.recording import append_only as appendonly
 from birdslam.runtime.recording import scene
@@ -498,3 +499,24 @@ def test_measurements_that_are_missing_at_the_end_are_counted(last: int, tmp_pat
     assert recorder.over == (last == 9)
     assert recorder.dropped() == ({} if last == 9 else {"measurements": 9 - last})
     writer.close(recorder.end())
+
+
+@pytest.mark.parametrize(
+    ("assignment", "missed"),
+    [(FIRST, 0), (Assignment(restarts=1, resume=Resume(5, 0, 0)), 7), (Assignment(restarts=1), 12)],
+    ids=["first", "after a confirmed frame", "without a confirmed frame"],
+)
+def test_a_restarted_recorder_counts_the_frames_before_it(tmp_path: Path, assignment: Assignment, missed: int) -> None:
+    configuration = Configuration(vehicle="late", camera=CAMERA)
+    estimates = Backlog([Message(new_estimate(frame_id=12), Trace(), 0)])
+    bus = SimpleNamespace(
+        subscriber=lambda topic, depth, may_drop: estimates if topic == "estimate" else Backlog(),
+        publisher=lambda topic: SimpleNamespace(put=lambda record: None),
+        on_alive=lambda tell: None,
+    )
+    writer = RecordingWriter(tmp_path / "late.mcap", about(configuration, {}), CAMERA, flush_ms=1.0, sync=False)
+    recorder = Recorder(configuration, bus, writer, Vitals(), assignment)  # type: ignore[arg-type]
+    assert recorder.record_received(0.0)
+    counts = recorder.end()
+    assert counts["missed"] == counts["dropped"] == str(missed)
+    writer.close(counts)
