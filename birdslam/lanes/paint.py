@@ -1,8 +1,9 @@
 """Detects points of paint and of the road's edges in each row of a `RoadView`.
 
 Paint is brighter than both sides: the step filter of Nieto et al. 2011, 2 I(y) - I(y-t) - I(y+t) - |I(y-t) - I(y+t)|,
-which does not respond to the border of a shadow. A network's mask selects the ridges that are lines; the ridge gives
-the position, since the mask is coarser. Edges are the borders of the road's mask.
+which does not respond to the border of a shadow. The same filter finds yellow paint by its colour. A network's mask
+selects the ridges that are lines; the ridge gives the position, since the mask is coarser. Edges are the borders of the
+road's mask.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 
 from birdslam.geometry.arrays import Bools, Floats, Floats32, Ints
 from birdslam.geometry.bev import tilted
-from birdslam.lanes.road_view import LATTICE_M, RoadView
+from birdslam.lanes.road_view import LATTICE_M, Grid, RoadView
 
 STEP_FILTER_M = 0.28  # from a line's middle to the asphalt beside it; lines are up to 0.3 m wide
 MIN_RIDGE_SPACING_M = 0.3  # between two ridges
@@ -24,7 +25,8 @@ MAX_CRACK_M = 0.2  # darker stripes up to this width are filled before paint is 
 MAX_SYMBOL_LENGTH_M = 9.0  # longer paint is a line even if it touches a symbol
 SYMBOL_CONTRAST_RATIO = 0.5  # of the contrast of the brightest paint: kerbstones are paler
 MAX_BAND_M = 1.2  # max. width of paint for the estimate of the asphalt's brightness
-MIN_CONTRAST = 6.0  # min. response of a ridge in grey levels
+MIN_CONTRAST = 6.0  # min. response of a certain ridge in grey levels
+MIN_YELLOW = 25.0  # excess of yellow paint over the road's; JPEG and video store colour coarsely
 MIN_CONTRAST_SIGMAS = 5.0  # min. response over the spread of the responses of bare road
 # Max. pixel size at which a ridge outside the mask counts, so that a line of 0.14 m is two pixels wide: farther away it
 # may be a kerbstone, a rail or a joint
@@ -33,9 +35,10 @@ MAX_MASK_DISTANCE_M = 0.24  # max. distance between a ridge and a mask's paint
 MAX_MASK_WIDTH_M = 0.9  # max. width of a mask's line
 SIGMA_RIDGE_M = 0.03  # of a ridge's middle, beside the pixel's share
 SIGMA_MASK_M = 0.08  # of a mask's middle
-SIGMA_RIDGE_PX = 0.7  # sigma of a ridge in pixels
+SIGMA_RIDGE_PX, SIGMA_MASK_PX = 0.7, 2.0  # the same in pixels
 MAX_ROW_M = 0.4  # max. length of road per row
-UNMASKED_WEIGHT = 0.5  # evidence of a ridge outside the mask
+MIN_STRENGTH = 0.5  # min. response of a ridge over that of a certain one: a line is many weak ridges
+UNMASKED_WEIGHT = 0.5  # evidence of a certain ridge outside the mask
 MIN_PIECE_RATIO = 0.1  # min. area over the largest piece of the road's mask
 ROAD_MARGIN_M = 0.4  # a line at the road's edge lies partly outside the mask
 MAX_MASK_GAP_M = 0.25  # gaps of the road's mask that are closed: borders of markings and noise; a kerb is wider
@@ -43,6 +46,7 @@ MAX_MASK_GAP_M = 0.25  # gaps of the road's mask that are closed: borders of mar
 MAX_STRIPE_DISTANCE_M, MIN_STRIPE_RATIO, MAX_GAP_RATIO = 0.4, 0.5, 0.6
 MAX_DOUBLE_PIXEL_M = 0.025  # max. pixel size that resolves their gap
 MIN_DOUBLE_ROWS, MAX_DOUBLE_ROWS = 6, 16  # number of rows
+VEHICLE_MARGIN_M = 0.5  # from a vehicle: its shadow and what it covers
 SIGMA_EDGE_M = 0.25
 SIGMA_EDGE_PX = 3.0  # sigma of a mask's border in pixels: networks have a half or a quarter of the image's resolution
 
@@ -77,19 +81,30 @@ class LinePoints:
 
 
 def paint_points(view: RoadView) -> LinePoints:
-    """Middles of the bright ridges on the road, and of the mask's paint without a ridge."""
-    response = _response(view)
-    min_response, usable = _ridge_threshold(view, response)
-    symbols = _symbols(view, response, usable, min_response)
-    rows, columns, masked = _ridges(view, response, min_response, usable & ~symbols)
-    ridge_y = view.y_m[columns] + _band_offset_m(view, rows, columns)
-    alone_rows, alone_y = _mask_middles(view, usable & ~symbols, rows, columns)
+    """Middles of the bright or yellow ridges on the road, and of the mask's paint without a ridge."""
+    usable = _near_road(view)
+    response = _response(view.grey)
+    min_response = _min_response(response, usable, MIN_CONTRAST)
+    strength, plane = response / min_response, np.zeros(response.shape, np.int64)
+    if view.excess is not None:  # yellow paint on concrete may be as bright as the road
+        by_colour = _response(view.excess)
+        by_colour /= _min_response(by_colour, usable, MIN_YELLOW)
+        plane = (by_colour > strength).astype(np.int64)
+        strength = np.maximum(strength, by_colour)
+    clear = usable & ~_symbols(view, response, usable, min_response)
+    rows, columns, masked = _ridges(view, strength, clear)
+    ridge_y = view.y_m[columns] + _band_offset_m(view, rows, columns, plane[rows, columns])
+    strong = np.minimum(strength[rows, columns], 1.0)
+    alone_rows, alone_y = _mask_middles(view, clear, rows, columns)
+    alone = np.ones(len(alone_rows))
+    # The error of a ridge's position is inverse to its contrast
+    base = np.concatenate([SIGMA_RIDGE_M / strong, SIGMA_MASK_M * alone])
+    share = np.concatenate([SIGMA_RIDGE_PX / strong, SIGMA_MASK_PX * alone])
+    unmasked = UNMASKED_WEIGHT * (strong - MIN_STRENGTH) / (1.0 - MIN_STRENGTH)
+    evidence = np.concatenate([np.where(masked, 1.0, unmasked), alone])
     rows = np.concatenate([rows, alone_rows])
     y_m = np.concatenate([ridge_y, alone_y])
-    by_mask = np.concatenate([np.zeros(len(ridge_y), bool), np.ones(len(alone_y), bool)])
-    masked = np.concatenate([masked, np.ones(len(alone_y), bool)])
-    base = np.where(by_mask, SIGMA_MASK_M, SIGMA_RIDGE_M)
-    share = np.where(by_mask, 2.0, SIGMA_RIDGE_PX)
+    masked = np.concatenate([masked, alone > 0.0])
     yellow = np.full(len(rows), np.nan)
     if view.excess is not None and len(rows):
         road = view.road[::2, ::3]
@@ -100,34 +115,38 @@ def paint_points(view: RoadView) -> LinePoints:
         view.x_m[rows],
         y_m,
         np.hypot(base, share * view.sigma_y_m[rows]),
-        np.minimum(view.row_m[rows], MAX_ROW_M) * np.where(masked, 1.0, UNMASKED_WEIGHT),
+        np.minimum(view.row_m[rows], MAX_ROW_M) * evidence,
         masked,
         yellow,
         share * view.pixel_rad,
     )
 
 
-def _response(view: RoadView) -> Floats32:
-    """(R, C) response of the step filter, in grey levels over the brighter side."""
-    smooth = cv2.blur(view.grey, (3, 1))
+def _response(values: Grid) -> Floats32:
+    """(R, C) response of the step filter, in levels over the brighter side."""
+    smooth = cv2.blur(values, (3, 1))
     t = round(STEP_FILTER_M / LATTICE_M)
     padded = cv2.copyMakeBorder(smooth, 0, 0, t, t, cv2.BORDER_REPLICATE)
     right, left = padded[:, : -2 * t], padded[:, 2 * t :]
     return np.asarray(smooth - np.maximum(left, right), np.float32)  # half of Nieto's response
 
 
-def _ridge_threshold(view: RoadView, response: Floats32) -> tuple[float, Bools]:
-    """Returns the min. response of a ridge and the cells on the road and at its border."""
+def _near_road(view: RoadView) -> Bools:
+    """(R, C) cells on the road and at its border."""
     reach = 2 * round(ROAD_MARGIN_M / LATTICE_M) + 1
     on_road = cv2.dilate(_without_small_pieces(view).view(np.uint8), np.ones((1, reach), np.uint8)) > 0
-    usable = on_road & ~view.hidden & ~view.outside
+    return np.asarray(on_road & ~view.hidden & ~view.outside)
+
+
+def _min_response(response: Floats32, usable: Bools, least: float) -> float:
+    """Min. response of a ridge that is certain, at least `least`."""
     bare = response[::2, ::3][usable[::2, ::3]]  # every sixth cell is enough
     if not len(bare):
-        return MIN_CONTRAST, usable
+        return least
     # The response of bare road is negative with the spread of the texture
     middle = float(np.median(bare))
     spread = 1.4826 * float(np.median(np.abs(bare - middle)))
-    return max(MIN_CONTRAST, MIN_CONTRAST_SIGMAS * spread + min(middle, 0.0)), usable
+    return max(least, MIN_CONTRAST_SIGMAS * spread + min(middle, 0.0))
 
 
 def _without_small_pieces(view: RoadView) -> Bools:
@@ -181,28 +200,30 @@ def _runs(mask: Bools) -> tuple[Ints, Ints, Ints]:
     return row, first, past
 
 
-def _ridges(view: RoadView, response: Floats32, min_response: float, usable: Bools) -> tuple[Ints, Ints, Bools]:
-    """Rows and columns of the ridges' maxima on the road, and whether they are near the mask's paint."""
+def _ridges(view: RoadView, strength: Floats32, usable: Bools) -> tuple[Ints, Ints, Bools]:
+    """Rows and columns of the ridges' maxima on the road, and whether they are near the mask's paint.
+
+    `strength` (R, C) is the response over that of a certain ridge.
+    """
     apart = 2 * round(MIN_RIDGE_SPACING_M / LATTICE_M) + 1
-    crest = cv2.blur(response, (3, 1))
-    peaks = usable & (response > min_response) & (crest >= cv2.dilate(crest, np.ones((1, apart), np.uint8)))
+    crest = cv2.blur(strength, (3, 1))
+    peaks = usable & (strength > MIN_STRENGTH) & (crest >= cv2.dilate(crest, np.ones((1, apart), np.uint8)))
     near_paint = cv2.dilate(
         view.paint.view(np.uint8), np.ones((1, 2 * round(MAX_MASK_DISTANCE_M / LATTICE_M) + 1), np.uint8)
     )
-    # A weaker ridge counts near the mask's paint
-    weak = usable & (near_paint > 0) & (response > 0.5 * min_response)
-    peaks |= weak & (crest >= cv2.dilate(crest, np.ones((1, apart), np.uint8)))
     peaks &= (near_paint > 0) | (view.sigma_y_m[:, None] <= MAX_UNMASKED_PIXEL_M)
     rows, columns = peaks.nonzero()
     return rows, columns, near_paint[rows, columns] > 0
 
 
-def _band_offset_m(view: RoadView, rows: Ints, columns: Ints) -> Floats:
-    """From the column of a ridge's maximum to the middle of its bright band."""
+def _band_offset_m(view: RoadView, rows: Ints, columns: Ints, plane: Ints) -> Floats:
+    """From the column of a ridge's maximum to the middle of its bright (`plane` 0) or yellow (1) band."""
     reach = round(STEP_FILTER_M / LATTICE_M)
     steps = np.arange(-reach, reach + 1)
     at = np.clip(columns[:, None] + steps, 0, len(view.y_m) - 1)
     values = view.grey[rows[:, None], at]
+    if view.excess is not None:
+        values = np.where(plane[:, None] > 0, view.excess[rows[:, None], at], values)
     floor = np.maximum(values[:, :1], values[:, -1:])
     share = np.maximum(values - floor, 0.0)
     out: Floats = (share * steps).sum(axis=1) / np.maximum(share.sum(axis=1), 1e-6) * LATTICE_M
@@ -259,17 +280,26 @@ def edge_points(view: RoadView, middle_m: Floats) -> tuple[LinePoints, LinePoint
     count, rows = len(view.y_m), np.arange(len(view.x_m))
     start = np.clip(np.searchsorted(view.y_m, middle_m), 0, count - 1)
     index = np.arange(count, dtype=np.int32)
-    beyond = np.arange(round(0.5 / LATTICE_M))  # a vehicle that covers these may cover the border
     out = []
     for side in (1, -1):
         stops = ~free & (side * index > side * start[:, None])
         at = stops.argmax(axis=1) if side > 0 else count - 1 - stops[:, ::-1].argmax(axis=1)
-        past = np.clip(at[:, None] + side * beyond, 0, count - 1)
         kept = free[rows, start] & stops.any(axis=1) & ~view.outside[rows, at]
-        kept &= ~view.hidden[rows[:, None], past].any(axis=1)
+        kept &= ~beside_vehicles(view, side)[rows, at]
         y_m = view.y_m[at] - 0.5 * side * LATTICE_M
         out.append(border_at(view, np.flatnonzero(kept), y_m[kept], SIGMA_EDGE_M, SIGMA_EDGE_PX))
     return out[0], out[1]
+
+
+def beside_vehicles(view: RoadView, side: int) -> Bools:
+    """(R, C) cells that a vehicle covers, or may shade or hide the border of: it begins within VEHICLE_MARGIN_M.
+
+    `side` 1: the vehicle is to the left of the cell, -1: to the right.
+    """
+    cells = round(VEHICLE_MARGIN_M / LATTICE_M) + 1
+    anchor = (cells - 1 if side < 0 else 0, 0)
+    hidden = cv2.dilate(view.hidden.view(np.uint8), np.ones((1, cells), np.uint8), anchor=anchor)
+    return np.asarray(hidden > 0)
 
 
 def border_at(view: RoadView, rows: Ints, y_m: Floats, sigma_m: float, sigma_px: float) -> LinePoints:

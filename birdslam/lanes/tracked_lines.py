@@ -13,6 +13,7 @@ from birdslam.geometry.camera import VerticalCurvature
 from birdslam.geometry.se2 import SE2
 from birdslam.lanes.curves import across_sigma_m, basis, transform_curves
 from birdslam.lanes.line_filter import MAX_DISTANCE_M, MAX_SLOPE, Tilt
+from birdslam.lanes.paint import MIN_YELLOW
 from birdslam.types import LaneLine, LineColour, LineKind
 
 PAINT, LEFT_EDGE, RIGHT_EDGE = 0, 1, 2  # classes of lines; points correct only lines of their class
@@ -27,7 +28,6 @@ MIN_DOUBLE_RATIO, MIN_RESOLVED = (
     0.5,
     3.0,
 )  # min. share of rows with two stripes, and min. number of images: kerbs may show two
-MIN_YELLOW = 25.0  # min. excess over the road's
 
 AHEAD_M = np.arange(5.0, MAX_RANGE_M + 1.0, 5.0)
 AHEAD = basis(AHEAD_M)
