@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
+from itertools import product
 from pathlib import Path
 
 import cv2
@@ -47,6 +48,7 @@ from birdslam.types import (
     LaneChange,
     LaneLine,
     Lanes,
+    LineColour,
     LineKind,
     VehicleEstimate,
     VehicleLane,
@@ -362,6 +364,47 @@ def test_far_ridge_without_segmentation_is_not_a_line() -> None:
     assert np.count_nonzero(masked.x_m * pixel_m <= MAX_UNMASKED_PIXEL_M) == len(unseen)
 
 
+def textured(image: np.ndarray, sigma: float, seed: int = 3) -> np.ndarray:
+    noise = np.random.default_rng(seed).normal(0.0, sigma, image.shape)
+    return np.clip(image + noise, 0.0, 255.0).astype(np.uint8)
+
+
+@pytest.mark.parametrize("contrast", [1.0, 0.25])
+def test_lines_on_coarse_asphalt_without_segmentation_are_found(contrast: float) -> None:
+    """Single ridges are as weak as the texture's, but there are many on one line."""
+    image, masks = picture(SE2(), (1.7, -1.8), (True, True))
+    asphalt = image.astype(np.float64)
+    asphalt[masks.road] = 90.0 + contrast * (asphalt[masks.road] - 90.0)
+    unseen = Segmentation(masks.road, np.zeros_like(masks.lane))
+    lines, _ = find_lines_in_image(CAMERA, textured(asphalt, 8.0), unseen, NOBODY)
+    row = lane_row(lines)
+    assert row.ego is not None
+    assert row.lanes[row.ego].left_m(10.0) == pytest.approx(1.7, abs=0.15)
+    assert row.lanes[row.ego].right_m(10.0) == pytest.approx(-1.8, abs=0.15)
+
+
+def test_coarse_asphalt_has_no_lines() -> None:
+    image, masks = picture(SE2(), (), ())
+    for seed in range(8):
+        lines, _ = find_lines_in_image(CAMERA, textured(image, 8.0, seed), masks, NOBODY)
+        assert not [line for line in lines if line.kind is not LineKind.EDGE]
+
+
+def test_yellow_line_as_bright_as_the_road_is_found() -> None:
+    """Yellow paint on concrete has no contrast in a grey image."""
+    image, masks = picture(SE2(), (1.7, -1.8), (False, False))
+    colour = np.repeat(image[:, :, None], 3, axis=2)
+    left = cv2.dilate(masks.lane.view(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    left &= np.arange(image.shape[1]) < CAMERA.cx_px
+    yellow = np.array([20, 94, 110])  # BGR
+    colour[left] = yellow
+    assert cv2.cvtColor(colour, cv2.COLOR_BGR2GRAY)[left] == pytest.approx(90.0, abs=1.0)
+    lines, _ = find_lines_in_image(CAMERA, colour, Segmentation(masks.road, masks.lane & ~left), NOBODY)
+    (found,) = (line for line in lines if line.offset_m > 0.0 and line.kind is not LineKind.EDGE)
+    assert found.y_m(10.0) == pytest.approx(1.7, abs=0.1)
+    assert found.colour is LineColour.YELLOW
+
+
 def test_grass_classified_as_road_has_no_line() -> None:
     image, masks = picture(SE2(), (1.7, -1.8, -9.4), (True, False, False))
     clear = points_of(image, masks)
@@ -445,6 +488,15 @@ def test_bright_kerb_beyond_the_road_edge_is_not_a_bound(kerb_m: float, bound: B
     assert row.ego == 0
     assert row.lanes[0].right_bound is bound
     assert row.lanes[0].right_m(0.0) == pytest.approx(-1.75 if bound is Bound.EDGE else kerb_m)
+
+
+@pytest.mark.parametrize(("left", "right"), list(product((LineKind.SOLID, LineKind.EDGE), repeat=2)))
+def test_strip_nearer_to_one_lane_than_to_two_is_a_lane(left: LineKind, right: LineKind) -> None:
+    (wide,) = lane_row((line(1, 2.4, left), line(2, -2.4, right))).lanes
+    assert (wide.left, wide.right) == (1, 2)
+    own = lane_row((line(1, 1.7, left), line(2, -5.0, right)))
+    assert own.ego is not None
+    assert (own.lanes[own.ego].right_bound is Bound.WIDTH) == (LineKind.SOLID in (left, right))
 
 
 def test_lane_with_one_line_is_completed_by_width() -> None:

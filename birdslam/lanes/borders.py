@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from birdslam.geometry.arrays import Bools, Floats
-from birdslam.lanes.paint import LinePoints, border_at
+from birdslam.lanes.paint import LinePoints, beside_vehicles, border_at
 from birdslam.lanes.road_view import LATTICE_M, RoadView
 from birdslam.lanes.topology import WIDTH_M, WIDTH_SIGMA_M
 
@@ -39,7 +39,7 @@ def border_points(view: RoadView, bound_m: Floats, stretch: Floats, side: int, m
     rows = (view.x_m > NEAR_M) & (view.x_m < FAR_M)
     column = np.round((y_m - view.y_m[0]) / LATTICE_M).astype(np.int64)
     at = np.arange(len(view.x_m))[:, None], np.clip(column, 0, len(view.y_m) - 1)
-    seen = rows[:, None] & (column == at[1]) & ~view.outside[at] & ~view.hidden[at]
+    seen = rows[:, None] & (column == at[1]) & ~view.outside[at] & ~beside_vehicles(view, side)[at]
     planes = [view.grey] if view.excess is None else [view.grey, view.excess]
     votes = [_step_votes(plane[at], seen) for plane in planes]
     weight = view.row_m[:, None] * seen

@@ -22,7 +22,7 @@ from birdslam.lanes.line_filter import VERTICAL, LineFilter, Support, Tilt
 from birdslam.lanes.paint import LinePoints, double_line_share, edge_points, paint_points
 from birdslam.lanes.parallel_search import MAX_SEARCH_M, Peak, Shape, find_lines, find_shape
 from birdslam.lanes.road_view import LATTICE_M, RoadView, nearest_visible_m, road_view
-from birdslam.lanes.topology import AT_M, MAX_LANE_TO_EDGE_M
+from birdslam.lanes.topology import AT_M, MAX_LANE_M, MAX_STRIP_M
 from birdslam.lanes.tracked_lines import LEFT_EDGE, PAINT, RIGHT_EDGE, Track, TrackedLines, existence_of
 from birdslam.perception import Segmentation
 from birdslam.types import LaneLine
@@ -178,9 +178,9 @@ class LineTracker:
     ) -> tuple[LinePoints, LinePoints]:
         """The edges' points; where the ego's lane has `paint` (n, 4) on one side only, those of its other border."""
         y_m = paint @ basis(np.array([AT_M]))[0]
-        near = sorted(np.flatnonzero(np.abs(y_m) < MAX_LANE_TO_EDGE_M), key=lambda k: abs(y_m[k]))
+        near = sorted(np.flatnonzero(np.abs(y_m) < MAX_STRIP_M), key=lambda k: abs(y_m[k]))
         bounds = [next((k for k in near if side * y_m[k] > 0.0), None) for side in (1, -1)]
-        if None not in bounds and abs(y_m[bounds[0]] - y_m[bounds[1]]) < MAX_LANE_TO_EDGE_M:
+        if None not in bounds and abs(y_m[bounds[0]] - y_m[bounds[1]]) < MAX_LANE_M:
             return left, right
         if near and near[0] == bounds[0]:  # of two that are too far apart the nearer is the ego's
             right = border_points(view, *self._in_rows(view, paint[near[0]], tilt), -1, right)

@@ -18,13 +18,12 @@ from birdslam.types import Bound, Lane, LaneLine, LineKind
 
 AT_M = 8.0  # distance at which lanes are compared: in view of most cameras and precise
 MIN_LANE_M, MAX_LANE_M = 2.3, 4.2
-MAX_LANE_TO_EDGE_M = 4.6  # of a lane that ends at the road's edge
-MAX_PAINTED_LANE_M = 5.5  # between two painted lines, on ramps and in bends
 MIN_STRIP_M = 0.8  # a hard shoulder or a cycle lane; a painted line closer to an edge replaces it
 NO_LANE_COST = 0.6  # of a strip that is not a lane
-WIDE_COST = 0.4  # of a lane wider than MAX_LANE_M
+WIDE_COST = 0.4  # of a strip wider than MAX_STRIP_M
 MIN_KERB_M, MAX_KERB_M = 0.1, 0.6  # distance of a kerbstone past the edge, since a mask's border is imprecise
 WIDTH_M, WIDTH_SIGMA_M = 3.3, 0.5  # prior of lane widths: 2.75 to 3.75 m by road standards, and wider ones
+MAX_STRIP_M = 1.5 * WIDTH_M  # of one lane: a wider strip is nearer to two
 MIN_END_WIDTH_M = 1.9  # a lane ends where it is narrower
 STEP_M, MIN_END_SIGMAS = 2.0, 2.0  # step and confidence of the search for a lane's end
 
@@ -88,25 +87,19 @@ def _is_kerb(line: LaneLine, edge: LaneLine) -> bool:
 
 def _strip_cost(left: LaneLine, right: LaneLine) -> float:
     width = left.y_m(AT_M) - right.y_m(AT_M)
-    at_edge = LineKind.EDGE in (left.kind, right.kind)
     if width < MIN_STRIP_M:
         return 2.0
     if width < MIN_LANE_M:
         return NO_LANE_COST
-    if width < (MAX_LANE_TO_EDGE_M if at_edge else MAX_LANE_M):
-        return 0.0
-    return WIDE_COST
+    return 0.0 if width < MAX_STRIP_M else WIDE_COST
 
 
 def _is_lane(left: LaneLine, right: LaneLine) -> bool:
     """Whether the strip between two bounds is a lane."""
     width = left.y_m(AT_M) - right.y_m(AT_M)
-    edges = (left.kind is LineKind.EDGE) + (right.kind is LineKind.EDGE)
     if width < MIN_LANE_M or left.offset_m - right.offset_m < MIN_STRIP_M:
         return False
-    if edges == 2:
-        return True
-    return width < (MAX_LANE_TO_EDGE_M if edges else MAX_PAINTED_LANE_M)
+    return width < MAX_STRIP_M or (left.kind is LineKind.EDGE and right.kind is LineKind.EDGE)
 
 
 def _curve(line: LaneLine | Lane) -> Floats:
