@@ -23,7 +23,7 @@ from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.lanes.curves import basis, transform_curves
 from birdslam.lanes.ego_lane import EgoLane
-from birdslam.lanes.line_filter import PLANE_AT_M
+from birdslam.lanes.line_filter import PLANE_AT_M, LineFilter
 from birdslam.lanes.line_tracker import LineTracker, find_lines_in_image
 from birdslam.lanes.occupancy import MAX_DISTANCE_M, with_users
 from birdslam.lanes.outline import lane_mask, lane_px, line_px
@@ -223,6 +223,36 @@ def test_lines_of_a_bend_through_a_sag_do_not_meet(told: float) -> None:
         x_m += float(rng.choice([1.0, 2.0, 3.0, 4.0]))
     assert np.median(off) < 0.25
     assert np.mean(inside) > 0.95
+
+
+def test_lines_out_of_a_tight_bend_become_straight() -> None:
+    """A clothoid of 10 m leads from 25 m radius to a straight road; lines are sought near the predicted ones."""
+    s_m = np.arange(0.0, 120.0, 0.25)
+    bend = np.interp(s_m, [30.0, 40.0], [1 / 25, 0.0])
+    yaw = np.cumsum(bend) * 0.25
+    middle = np.column_stack([np.cumsum(np.cos(yaw)), np.cumsum(np.sin(yaw))]) * 0.25
+    aside = np.column_stack([-np.sin(yaw), np.cos(yaw)])
+    poses = [SE2(*middle[k], yaw[k]) for k in range(80, 260, 4)]
+    offsets_m, rng = np.array([1.75, -1.75]), np.random.default_rng(2)
+    lines = LineFilter()
+    lines.restart(offsets_m, np.zeros(2), 1 / 25, np.zeros(2, bool))
+    late = []
+    for k, pose in enumerate(poses):
+        if k:
+            lines.predict(poses[k - 1].between(pose))
+        true = [pose.inverse() @ (middle + off * aside) for off in offsets_m]
+        seen = np.vstack(
+            [line[(line[:, 0] > 5.0) & (line[:, 0] < 30.0) & (np.abs(line[:, 1]) < 10.0)] for line in true]
+        )
+        count = len(seen)
+        points = LinePoints(
+            seen[:, 0], seen[:, 1] + rng.normal(0.0, 0.03, count), np.full(count, 0.05), np.full(count, 0.25),
+            np.ones(count, bool), np.full(count, np.nan), np.full(count, 1e-3),
+        )  # fmt: skip
+        lines.update(points, np.zeros(count, np.int64), np.zeros(2, np.int64), 1.5, 0.002, 1.0)
+        if k > 35:  # on the straight
+            late.append(np.abs(lines.curves @ basis(np.array([25.0]))[0] - offsets_m))
+    assert np.max(late) < 0.3
 
 
 def test_biased_direction_of_travel_does_not_drag_lines() -> None:

@@ -29,6 +29,9 @@ SIGMA_OWN_EDGE = np.array([0.3, 0.02, 5e-4, 1e-5])  # of a road's edge: a mask's
 WALK_SHAPE = np.array([0.0, 0.0, 2e-4, 4e-5])
 WALK_OWN = np.array([0.008, 8e-4, 3e-5, 2e-6])
 RATE_MEMORY_M = 30.0  # decay of a clothoid's rate of curvature
+# The clothoid that ends a bend of radius R is R / 9 to R long (RAA: A is R / 3 to R). On R / 3 its rate is 3 / R^2.
+# With 2 / R^2 as 1-sigma the random walk is 2 / R^2 sqrt(6 / R) per root metre
+WALK_RATE_OF_BEND = 2.0 * 6.0**0.5
 # Errors of the ego's motion per metre of travel: lateral and heading
 STEP_SIGMAS = np.array([0.005, 0.001, 0.0, 0.0])
 BIN_M = 1.0  # points of a line within one bin are one observation
@@ -153,9 +156,9 @@ class LineFilter:
         self.common = decay * self.common
         self.cov = J @ self.cov @ J.T
         self.cov[:COMMON, :COMMON] += np.diag((1.0 - decay**2) * SIGMA_COMMON**2)
-        own = _expand_variances(WALK_SHAPE**2, WALK_OWN**2, count) + _expand_variances(
-            STEP_SIGMAS**2, np.zeros(4), count
-        )
+        shape = WALK_SHAPE**2
+        shape[3] += (WALK_RATE_OF_BEND * abs(float(self.curves[:, 2].mean())) ** 2.5) ** 2
+        own = _expand_variances(shape + STEP_SIGMAS**2, WALK_OWN**2, count)
         self.cov[COMMON:, COMMON:] += own * step_m
 
     def valid_lines(self) -> Bools:
