@@ -428,7 +428,8 @@ def test_a_crowd_is_cut_to_the_nearest_sixty() -> None:
 )
 @settings(max_examples=25)
 def test_closest_approach_assumes_constant_velocities(p: tuple[float, float], v: tuple[float, float]) -> None:
-    (found,) = approaches(np.array([complex(*p)]), np.array([complex(*v)]), 1e-4 * np.eye(4)[None])
+    means, deviators = np.full((2, 1), 1e-4), np.zeros((2, 1), np.complex128)
+    (found,) = approaches(np.array([complex(*p)]), np.array([complex(*v)]), means, deviators)
     times = np.linspace(0.0, 30.0, 30_001)
     away = np.hypot(p[0] + v[0] * times, p[1] + v[1] * times)
     assert found.distance_m == pytest.approx(away.min(), abs=0.01)

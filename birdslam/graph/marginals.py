@@ -56,15 +56,14 @@ def vehicle_estimates(
     sizes = np.array([v.size_bias_rel for v in vehicles])  # relative 1-sigma of each distance due to the size
     at, heading, velocities, covs = marginals_in_world(window, ahead_s, changes)
     covs += _of_sizes(window.world, ego_mps, sizes, at, heading, velocities)
-    moving, moving_covs = velocities.view(np.float64).reshape(-1, 2), covs[:, 3:, 3:]
     if birth_det is not None:
-        judge(vehicles, moving, moving_covs, birth_det, t_ns)
-        moving, moving_covs = reported_velocities(vehicles, moving, moving_covs)
-    near = _approaches(window, ego_mps, sizes, at, moving, moving_covs)
+        judge(vehicles, velocities.view(np.float64).reshape(-1, 2), covs[:, 3:, 3:], birth_det, t_ns)
+        velocities, covs[:, 3:, 3:] = reported_velocities(vehicles, velocities, covs[:, 3:, 3:])
+    near = _approaches(window, ego_mps, sizes, at, velocities, covs[:, 3:, 3:])
     numbers = np.empty((len(vehicles), 18))  # a row for each record
     numbers[:, 0], numbers[:, 1], numbers[:, 2] = at.real, at.imag, np.arctan2(heading.imag, heading.real)
-    numbers[:, 3:5], numbers[:, 5:9] = moving, moving_covs.reshape(-1, 4)
-    numbers[:, 9:].reshape(-1, 3, 3)[...] = covs[:, :3, :3]
+    numbers[:, 3], numbers[:, 4] = velocities.real, velocities.imag
+    numbers[:, 5:9].reshape(-1, 2, 2)[...], numbers[:, 9:].reshape(-1, 3, 3)[...] = covs[:, 3:, 3:], covs[:, :3, :3]
     return tuple(
         VehicleEstimate(
             vehicle=v.vehicle,
@@ -91,20 +90,23 @@ def vehicle_estimates(
 
 
 def _approaches(
-    window: Window, ego_mps: complex, sizes: Floats, at: Complexes, velocities: Floats, covs: Floats
+    window: Window, ego_mps: complex, sizes: Floats, at: Complexes, velocities: Complexes, covs: Floats
 ) -> list[Approach]:
     """Returns the closest approach of each vehicle, computed in ego, where the ego's error in world cancels.
 
-    `at` (M,), `velocities` (M, 2) and their `covs` (M, 2, 2) are in world; `sizes` (M,).
+    `at` and `velocities` (M,) and the covariances (M, 2, 2) of the latter are in world; `sizes` (M,).
     """
     back, origin = cmath.rect(1.0, -window.world.yaw_rad), complex(window.world.x_m, window.world.y_m)
-    p, v = (at - origin) * back, (velocities[:, 0] + 1j * velocities[:, 1]) * back - ego_mps
-    turn = np.array([[back.real, -back.imag], [back.imag, back.real]])
-    by_size = (sizes * p).view(np.float64).reshape(-1, 2)
-    both = np.zeros((len(p), 4, 4))
-    both[:, :2, :2] = window.each_vehicle[:, :2, :2] + by_size[:, :, None] * by_size[:, None]
-    both[:, 2:, 2:] = turn @ covs @ turn.T
-    return approaches(p, v, both)
+    p, v = (at - origin) * back, velocities * back - ego_mps
+    both = np.empty((2, 2, 2, len(p)))
+    both[:, :, 0], both[:, :, 1] = window.each_vehicle[:, :2, :2].transpose(1, 2, 0), covs.transpose(1, 2, 0)
+    means, deviators = 0.5 * (both[0, 0] + both[1, 1]), 0.5 * (both[0, 0] - both[1, 1]) + 1j * both[0, 1]
+    by_size = sizes * p
+    square = 0.5 * by_size * by_size
+    means[0] += np.abs(square)
+    deviators[0] += square
+    deviators[1] *= back * back
+    return approaches(p, v, means, deviators)
 
 
 def _of_sizes(

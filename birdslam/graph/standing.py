@@ -7,12 +7,12 @@ hysteresis; the velocity has the covariance of a mixture. docs/method.md ("Stati
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import overload
 
 import numpy as np
 
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Complexes, Floats
 from birdslam.graph.vehicles import VehicleNode
 from birdslam.types import Moves
 
@@ -25,35 +25,44 @@ _MIN_DET = 1e-12  # of a velocity's covariance, (m/s)^4
 _SHARE = {Moves.STANDING: 1.0, Moves.DRIVING: 0.0}
 
 
+def _logit(probability: float) -> float:
+    return math.log(max(probability, 1e-12) / max(1.0 - probability, 1e-12))
+
+
+_PRIOR_LOG_ODDS, _BESIDE_LOG_ODDS = _logit(PRIOR), _logit(PRIOR_BESIDE) - _logit(PRIOR)
+_MAX_LOG_ODDS = _logit(MAX_PROBABILITY)
+
+
+def _clipped(log_odds: float) -> float:
+    return min(max(log_odds, -_MAX_LOG_ODDS), _MAX_LOG_ODDS)
+
+
+def _probability(log_odds: float) -> float:
+    return 1.0 / (1.0 + math.exp(-log_odds))
+
+
 def judge(vehicles: Sequence[VehicleNode], velocities: Floats, covs: Floats, birth_det: float, t_ns: int) -> None:
     """Updates `standing` and `moves` of the vehicles that have an edge in this frame, at source time `t_ns`.
 
     `velocities` (M, 2) in m/s with `covs` (M, 2, 2) come from the graph; `birth_det` is the determinant of such a
     covariance for a new vehicle.
     """
-    rows = [row for row, v in enumerate(vehicles) if v.seen_ns == t_ns and v.standing_seen is not None]
-    if not rows:
-        return
-    x, y = velocities[rows].T
-    xx, xy, yy = covs[rows, 0, 0], covs[rows, 0, 1], covs[rows, 1, 1]
-    det = np.maximum(xx * yy - xy * xy, _MIN_DET)
-    z2 = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / det
-    by_velocity = _clipped(_logit(PRIOR) + 0.5 * (np.log(birth_det / det) - z2))
-    seen = np.array([vehicles[row].standing_seen for row in rows], np.float64)
-    # Both probabilities assume PRIOR
-    beside = np.array([vehicles[row].beside for row in rows]) * (_logit(PRIOR_BESIDE) - _logit(PRIOR))
-    by_growth = _clipped(_logit(seen))
-    # The graph does not estimate the velocity of a fixed vehicle
-    by_velocity = np.where([vehicles[row].is_fixed for row in rows], by_growth, by_velocity)
-    pooled = _probability((by_velocity + by_growth) / 2.0 + beside)
-    alone = _probability(by_velocity)
-    for row, standing, by_velocity_alone in zip(rows, pooled.tolist(), alone.tolist(), strict=True):
-        v = vehicles[row]
+    log_birth = math.log(birth_det)
+    for v, (x, y), ((xx, xy), (_, yy)) in zip(vehicles, velocities.tolist(), covs.tolist(), strict=True):
+        if v.seen_ns != t_ns or v.standing_seen is None:
+            continue
+        by_growth = by_velocity = _clipped(_logit(v.standing_seen))
+        if not v.is_fixed:  # else the graph does not estimate its velocity
+            det = max(xx * yy - xy * xy, _MIN_DET)
+            z2 = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / det
+            by_velocity = _clipped(_PRIOR_LOG_ODDS + 0.5 * (log_birth - math.log(det) - z2))
+        # Both probabilities assume PRIOR
+        standing = _probability((by_velocity + by_growth) / 2.0 + (_BESIDE_LOG_ODDS if v.beside else 0.0))
         if not v.in_path:
             v.standing, v.moves = standing, decide(v.moves, standing)
         elif standing <= 1.0 - DECIDED:  # an error of size or tilt can't explain the slow approach
             v.standing, v.moves = standing, Moves.DRIVING
-        elif v.moves is not Moves.DRIVING and by_velocity_alone <= 1.0 - DECIDED:
+        elif v.moves is not Moves.DRIVING and _probability(by_velocity) <= 1.0 - DECIDED:
             v.standing, v.moves = None, Moves.UNDECIDED
 
 
@@ -67,37 +76,18 @@ def decide(before: Moves, standing: float) -> Moves:
     return Moves.UNDECIDED if given_up else before
 
 
-def reported_velocities(vehicles: Sequence[VehicleNode], velocities: Floats, covs: Floats) -> tuple[Floats, Floats]:
-    """Returns velocities u (M, 2) in m/s with covariances (M, 2, 2), from those of the graph, which assume motion.
+def reported_velocities(
+    vehicles: Sequence[VehicleNode], velocities: Complexes, covs: Floats
+) -> tuple[Complexes, Floats]:
+    """Returns velocities u (M,) in m/s with covariances (M, 2, 2), from those of the graph, which assume motion.
 
     The velocity is 0 with the probability p of being stationary, else N(v, P); u = (1 - w) v, and the covariance is
     (1 - p) P + ((1 - p) w^2 + p (1 - w)^2) v v' + p sigma^2 I; w is 1 if stationary, 0 if moving, else p.
     """
     stands = [v.standing or 0.0 for v in vehicles]
-    p = np.array(stands)
-    w = np.array([_SHARE.get(v.moves, of) for v, of in zip(vehicles, stands, strict=True)])
-    spread = (1.0 - p) * w * w + p * (1.0 - w) ** 2
-    reported = (1.0 - p)[:, None, None] * covs
-    reported += (spread[:, None] * velocities)[:, :, None] * velocities[:, None]
-    reported[:, 0, 0] += p * STANDING_MPS**2
-    reported[:, 1, 1] += p * STANDING_MPS**2
-    return (1.0 - w)[:, None] * velocities, reported
-
-
-def _clipped(log_odds: Floats) -> Floats:
-    most = _logit(MAX_PROBABILITY)
-    return np.minimum(np.maximum(log_odds, -most), most)
-
-
-def _probability(log_odds: Floats) -> Floats:
-    out: Floats = 1.0 / (1.0 + np.exp(-log_odds))
-    return out
-
-
-@overload
-def _logit(probability: float) -> float: ...
-@overload
-def _logit(probability: Floats) -> Floats: ...
-def _logit(probability: float | Floats) -> float | Floats:
-    out: float | Floats = np.log(np.maximum(probability, 1e-12) / np.maximum(1.0 - probability, 1e-12))
-    return out
+    p, w = np.array([stands, [_SHARE.get(v.moves, of) for v, of in zip(vehicles, stands, strict=True)]])
+    spread = np.sqrt((1.0 - p) * w * w + p * (1.0 - w) ** 2)
+    by_spread = (spread * velocities).view(np.float64).reshape(-1, 2)
+    reported = (1.0 - p)[:, None, None] * covs + by_spread[:, :, None] * by_spread[:, None]
+    reported.reshape(-1, 4)[:, ::3] += (p * STANDING_MPS**2)[:, None]
+    return (1.0 - w) * velocities, reported

@@ -8,8 +8,7 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
-from birdslam.lanes.curves import across_sigma_m, basis, slope_basis
-from birdslam.lanes.traffic import Traffic, TrafficPrior, lines_between
+from birdslam.lanes.traffic import Crossings, Traffic, TrafficPrior, crossings, lines_between
 from birdslam.lanes.users import SLOW_MPS, UserInEgo
 from birdslam.types import Lane, Lanes, Leader, VehicleLane
 
@@ -23,9 +22,10 @@ def with_users(lanes: Lanes, users: Sequence[UserInEgo], ego_mps: float, traffic
     near = [user for user in users if abs(user.T_ego_vehicle.x_m) < MAX_DISTANCE_M]
     if not lanes.lanes or not near:
         return traffic.with_directions(lanes)
-    between = lines_between(lanes, near)
+    at, lines = crossings([*lanes.lines, *lanes.lanes], near), len(lanes.lines)
+    between = lines_between(lanes.lines, at.select(slice(lines)))
     traffic.observe(near, between)
-    probabilities = _lane_probabilities(lanes.lanes, near)
+    probabilities = _lane_probabilities(lanes.lanes, at.select(slice(lines, None)))
     placed = [
         (user, _place_user(user, lanes.ego_index, shares, traffic.estimate_prior(user, line, ego_mps)))
         for user, shares, line in zip(near, probabilities, between, strict=True)
@@ -65,26 +65,22 @@ def _place_user(user: UserInEgo, index: int | None, shares: list[float], prior: 
     return VehicleLane(vehicle=user.vehicle, ego_lane=ego, left=left, right=right, oncoming=oncoming, off_road=off)
 
 
-def _lane_probabilities(lanes: Sequence[Lane], users: Sequence[UserInEgo]) -> list[list[float]]:
+def _lane_probabilities(lanes: Sequence[Lane], at: Crossings) -> list[list[float]]:
     """The probability of each user (outer list) to be between the bounds of each lane (inner list).
 
     The user's covariance counts across the lane's direction: where the lane bends aside, a longitudinal error moves the
     user across it. Vectorized over all pairs, since this runs in each frame.
     """
-    rows = [(u.T_ego_vehicle.x_m, u.T_ego_vehicle.y_m, u.cov[0, 0], u.cov[0, 1], u.cov[1, 1]) for u in users]
-    x_m, y_m, xx, xy, yy = (column[:, None] for column in np.array(rows).T)  # (users, 1)
-    shapes = [(n.offset_m, n.slope, n.curvature_per_m, n.curvature_rate_per_m2) for n in lanes]
-    curves, covs = np.array(shapes), np.array([lane.cov for lane in lanes]).reshape(-1, 4, 4)
-    to_m, width_m, growth = np.array([(lane.to_m, lane.width_m, lane.width_slope) for lane in lanes]).T
-    at_m = np.clip(x_m, 0.0, MAX_DISTANCE_M)
-    known_m, beyond_m = np.minimum(at_m, to_m), np.maximum(at_m - to_m, 0.0)  # (users, lanes)
-    at, bend = basis(known_m), 0.5 * BEND_SIGMA_PER_M * beyond_m * beyond_m
-    slope = (slope_basis(known_m) * curves).sum(axis=2)
+    width_m, growth = np.array([(lane.width_m, lane.width_slope) for lane in lanes]).T
+    beyond_m = np.maximum(at.x_m - at.known_m, 0.0)  # (users, lanes)
+    bend = 0.5 * BEND_SIGMA_PER_M * beyond_m * beyond_m
+    slope = at.curves[:, 1] + at.known_m * (at.curves[:, 2] + 0.5 * at.known_m * at.curves[:, 3])
+    xx, xy, yy = at.covs[:, 0, 0, None], at.covs[:, 0, 1, None], at.covs[:, 1, 1, None]
     variance = np.maximum(yy - slope * (2.0 * xy - slope * xx), 0.0)  # lateral: of y - slope x
-    sigma = np.sqrt(variance + across_sigma_m(at, covs) ** 2 + bend * bend + 1e-6)
-    centre = (at * curves).sum(axis=2) + slope * beyond_m
-    half = 0.5 * np.maximum(width_m + growth * known_m, 0.0)
-    left, right = ((centre + half - y_m) / sigma).tolist(), ((centre - half - y_m) / sigma).tolist()
+    sigma = np.sqrt(variance + at.variance + bend * bend + 1e-6)
+    off_m = at.curve_m + slope * beyond_m - at.y_m
+    half = 0.5 * np.maximum(width_m + growth * at.known_m, 0.0)
+    left, right = ((off_m + half) / sigma).tolist(), ((off_m - half) / sigma).tolist()
     return [
         [_normal_cdf(a) - _normal_cdf(b) for a, b in zip(above, below, strict=True)]
         for above, below in zip(left, right, strict=True)

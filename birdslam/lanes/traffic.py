@@ -14,7 +14,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from birdslam.lanes.curves import across_sigma_m, basis
+from birdslam.geometry.arrays import Floats
+from birdslam.lanes.curves import basis
 from birdslam.lanes.users import UserInEgo
 from birdslam.types import Lane, LaneLine, Lanes
 
@@ -199,22 +200,48 @@ def _drop_oldest(memory: dict[Any, Any]) -> None:
         del memory[next(iter(memory))]
 
 
-def lines_between(lanes: Lanes, users: Sequence[UserInEgo]) -> list[Between | None]:
+@dataclass(frozen=True)
+class Crossings:
+    """C curves at the x of U road users: lines of the road, or centre lines of lanes."""
+
+    x_m: Floats  # (U, 1) of the users
+    y_m: Floats  # (U, 1)
+    covs: Floats  # (U, 3, 3) of their poses
+    curves: Floats  # (C, 4)
+    known_m: Floats  # (U, C) x of each user, limited to the range in which the curve is known
+    curve_m: Floats  # (U, C) y of the curve there
+    variance: Floats  # (U, C) of it
+
+    def select(self, curves: slice) -> Crossings:
+        """Returns these curves alone."""
+        known_m, curve_m, variance = (each[:, curves] for each in (self.known_m, self.curve_m, self.variance))
+        return Crossings(self.x_m, self.y_m, self.covs, self.curves[curves], known_m, curve_m, variance)
+
+
+def crossings(curves: Sequence[LaneLine | Lane], users: Sequence[UserInEgo]) -> Crossings:
+    """Evaluates the curves at the road users."""
+    x_m, y_m = np.array([(user.T_ego_vehicle.x_m, user.T_ego_vehicle.y_m) for user in users]).T[..., None]
+    shapes = [(n.offset_m, n.slope, n.curvature_per_m, n.curvature_rate_per_m2, n.to_m, *n.cov) for n in curves]
+    numbers = np.array(shapes)
+    known_m = np.minimum(np.maximum(x_m, 0.0), numbers[:, 4])
+    at = basis(known_m)  # (U, C, 4)
+    by_curve = at.transpose(1, 0, 2) @ numbers[:, 5:].reshape(-1, 4, 4)
+    variance = (by_curve.transpose(1, 0, 2) * at).sum(axis=2)
+    curve_m = (at * numbers[:, :4]).sum(axis=2)
+    covs = np.array([user.cov for user in users])
+    return Crossings(x_m, y_m, covs, numbers[:, :4], known_m, curve_m, np.maximum(variance, 0.0))
+
+
+def lines_between(lines: Sequence[LaneLine], at: Crossings) -> list[Between | None]:
     """For each road user the nearest line that surely lies between it and the ego's lane, or None."""
-    if not lanes.lines or not users:
-        return [None] * len(users)
-    rows = [(user.T_ego_vehicle.x_m, user.T_ego_vehicle.y_m, user.cov[1, 1]) for user in users]
-    x_m, y_m, variance = (column[:, None] for column in np.array(rows).T)  # (users, 1)
-    shapes = [(n.offset_m, n.slope, n.curvature_per_m, n.curvature_rate_per_m2) for n in lanes.lines]
-    curves, covs = np.array(shapes), np.array([line.cov for line in lanes.lines]).reshape(-1, 4, 4)
-    at = basis(np.clip(x_m, 0.0, [line.to_m for line in lanes.lines]))  # (users, lines, 4)
-    line_m = (at * curves).sum(axis=2)
-    margin_m = MIN_BEYOND_SIGMAS * np.sqrt(np.maximum(variance, 0.0) + across_sigma_m(at, covs) ** 2)
-    beyond = (curves[:, 0] * y_m > 0.0) & ((y_m - line_m) * np.copysign(1.0, y_m) >= margin_m)
-    farthest = np.where(beyond, np.abs(line_m), -1.0)
-    nearest, found = farthest.argmax(axis=1), beyond.any(axis=1).tolist()
-    beyond_m = np.abs(y_m[:, 0] - line_m[np.arange(len(nearest)), nearest]).tolist()
+    if not lines:
+        return [None] * len(at.x_m)
+    margin_m = MIN_BEYOND_SIGMAS * np.sqrt(np.maximum(at.covs[:, 1, 1, None], 0.0) + at.variance)
+    side = np.copysign(1.0, at.y_m)
+    beyond = (at.curves[:, 0] * at.y_m > 0.0) & ((at.y_m - at.curve_m) * side >= margin_m)
+    nearest = np.where(beyond, np.abs(at.curve_m), -1.0).argmax(axis=1)
+    beyond_m = np.abs(at.y_m - at.curve_m).tolist()
     return [
-        Between(lanes.lines[k], past_m) if is_there else None
-        for k, past_m, is_there in zip(nearest.tolist(), beyond_m, found, strict=True)
+        Between(lines[k], past_m[k]) if is_beyond[k] else None
+        for k, past_m, is_beyond in zip(nearest.tolist(), beyond_m, beyond.tolist(), strict=True)
     ]

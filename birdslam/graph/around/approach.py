@@ -18,10 +18,10 @@ MIN_SPEED2_MPS2 = 0.01  # minimum of the squared relative velocity
 MAX_REPORTED = 1e9  # limit of every reported number
 
 
-def approaches(p: Complexes, v: Complexes, covs: Floats) -> list[Approach]:
+def approaches(p: Complexes, v: Complexes, means: Floats, deviators: Complexes) -> list[Approach]:
     """Returns the approaches of N road users with positions p and velocities v (N,) relative to the ego, in m and m/s.
 
-    `covs` (N, 4, 4) are the covariances of both, (x_m, y_m, x_mps, y_mps).
+    `means` and `deviators` (2, N) are the covariances of p and of v, as in costs.py; p and v are uncorrelated.
     """
     if not len(p):
         return []
@@ -33,14 +33,13 @@ def approaches(p: Complexes, v: Complexes, covs: Floats) -> list[Approach]:
     np.minimum(np.maximum(free, 0.0), HORIZON_S, out=time)
     at = p + v * time
     np.abs(at, out=distance)
-    by = np.empty((2, len(p), 2), np.complex128)  # derivatives of time and distance by p and v
-    by[0, :, 0] = v / square
-    by[0, :, 1] = (p + 2.0 * free * v) / square
-    by[1, :, 0] = at / np.maximum(distance, 1e-6)  # towards them
-    by[1, :, 1] = by[1, :, 0] * time
-    J = by.view(np.float64)  # (2, N, 4)
-    variances = ((J[:, :, None] @ covs)[:, :, 0] * J).sum(axis=2)
-    np.sqrt(np.maximum(variances, 0.0), out=numbers[1::2])
+    by = np.empty((2, 2, len(p)), np.complex128)  # derivatives of time and distance (first axis) by p and v
+    towards = at / np.maximum(distance, 1e-6)
+    by[0, 0], by[0, 1] = v / square, (p + 2.0 * free * v) / square
+    by[1, 0], by[1, 1] = towards, towards * time
+    squares = by * by
+    variances = means * np.abs(squares) + (deviators.conj() * squares).real
+    np.sqrt(np.maximum(variances[:, 0] + variances[:, 1], 0.0), out=numbers[1::2])
     sigma_s *= free == time
     np.minimum(numbers, MAX_REPORTED, out=numbers)
     soon = (time <= NEARBY_S) & (distance - NEARBY_SIGMA * sigma_m <= NEARBY_M)

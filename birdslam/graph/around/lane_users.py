@@ -21,11 +21,13 @@ def lane_users(
     people: Sequence[FollowedPerson],
 ) -> list[UserInEgo]:
     """Returns all road users; `vehicles` are the estimates of `nodes`. The ego's error in world is not included."""
-    T_ego_world, covs, users = window.world.inverse(), window.each_vehicle[:, POSE, POSE], []
-    for row, (node, estimate) in enumerate(zip(nodes, vehicles, strict=True)):
-        T_ego_vehicle = T_ego_world @ estimate.T_world_vehicle
-        by_size = node.size_bias_rel * np.array([T_ego_vehicle.x_m, T_ego_vehicle.y_m, 0.0])  # see marginals.py
-        cov = covs[row] + np.outer(by_size, by_size)
+    T_ego_world, users = window.world.inverse(), []
+    places = [T_ego_world @ estimate.T_world_vehicle for estimate in vehicles]
+    sizes = [(node.size_bias_rel * T.x_m, node.size_bias_rel * T.y_m) for node, T in zip(nodes, places, strict=True)]
+    by_size = np.array(sizes).reshape(-1, 2)  # see marginals.py
+    covs = window.each_vehicle[:, POSE, POSE].copy()
+    covs[:, :2, :2] += by_size[:, :, None] * by_size[:, None]
+    for estimate, T_ego_vehicle, cov in zip(vehicles, places, covs, strict=True):
         yaw_rad = estimate.T_world_vehicle.yaw_rad
         speed_mps = estimate.velocity_mps[0] * math.cos(yaw_rad) + estimate.velocity_mps[1] * math.sin(yaw_rad)
         size = estimate.length_m

@@ -44,17 +44,15 @@ def people_estimates(
         nearest = sorted(np.flatnonzero(sane).tolist(), key=lambda k: (away_m[k], people[k].person))[:MAX_PEOPLE]
         kept = sorted(nearest, key=lambda k: people[k].person)
         people, table = [people[k] for k in kept], table[kept]
-    p, v = np.ascontiguousarray(table[:, :4]).view(np.complex128).T
-    covs = np.zeros((len(people), 4, 4))
-    of_place, of_velocity = covs[:, :2, :2], covs[:, 2:, 2:]
-    of_place[...], of_velocity[...] = table[:, 4:8].reshape(-1, 2, 2), table[:, 8:].reshape(-1, 2, 2)
+    p, v = table.view(np.complex128)[:, :2].T
+    (xx, yy), (xy,) = table[:, [4, 8, 7, 11]].T.reshape(2, 2, -1), table[:, [5, 9]].T[None]
+    means, deviators = 0.5 * (xx + yy), 0.5 * (xx - yy) + 1j * xy  # of positions and velocities (2, N), as in costs.py
     if since_s > 0.0:
         p = p + v * since_s
-        of_place += of_velocity * since_s**2 + CHANGE_MPS**2 * since_s**3 / 3.0 * np.eye(2)
-        of_velocity += CHANGE_MPS**2 * since_s * np.eye(2)
-    near = approaches(p - complex(way.x_m, way.y_m), v - ego_mps, covs)
-    xx, xy, yy = (np.array([cov[:, i, j] for cov in (of_place, of_velocity)]) for i, j in ((0, 0), (0, 1), (1, 1)))
-    means, deviators = 0.5 * (xx + yy), 0.5 * (xx - yy) + 1j * xy  # as in costs.py
+        means[0] += means[1] * since_s**2 + CHANGE_MPS**2 * since_s**3 / 3.0
+        deviators[0] += deviators[1] * since_s**2
+        means[1] += CHANGE_MPS**2 * since_s
+    near = approaches(p - complex(way.x_m, way.y_m), v - ego_mps, means, deviators)
     speed = np.abs(v)
     heading = np.where(speed > TURNS_MPS, v / np.maximum(speed, TURNS_MPS), 1.0)  # relative to the ego
     # The error of the ego adds to all: its position, and its yaw times the distance
