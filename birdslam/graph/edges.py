@@ -22,8 +22,7 @@ class PoseEdges:
     cc: EgoEdge | None
     cv: list[VehicleEdge]
     vv: list[MotionEdge]
-    cv_numbers: Floats  # (k, 12) of each CV edge: x_m, y_m, yaw_rad and the covariance, row-major
-    vv_numbers: Floats  # (k, 12) the same of VV edges
+    vv_numbers: Floats  # (k, 12) of each VV edge: x_m, y_m, yaw_rad and the covariance, row-major
 
 
 @dataclass(slots=True)
@@ -35,6 +34,7 @@ class CvEdges:
     heading: Complexes  # (k,)
     covs: Floats  # (k, 3, 3)
     factors: Floats  # (k, 2, 2) of the places' covariances, by the lines of sight: lasting_error.py
+    sigma_rel: Floats  # (k, 2) 1-sigma of the places along and across the lines of sight, fractions of the distance
 
 
 @dataclass(slots=True)
@@ -62,7 +62,6 @@ def pose_edges(m: Measurements) -> PoseEdges:
         cc if cc is not None and _is_valid(cc.T_from_to, cc.cov) else None,
         cv,
         vv,
-        _numbers([part for e in cv for T in (e.T_ego_vehicle,) for part in ((T.x_m, T.y_m, T.yaw_rad), e.cov)]),
         _numbers([part for e in vv for T in (e.T_from_to,) for part in ((T.x_m, T.y_m, T.yaw_rad), e.cov)]),
     )
 

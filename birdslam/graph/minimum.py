@@ -16,6 +16,10 @@ from birdslam.graph.window import Window
 
 _MIN_VARIANCE = 1e-8  # (0.1 mm)^2, (0.1 mrad)^2: keeps the innovation covariance well-conditioned
 _LEFT_OUT = 1e12  # variance of an edge that is left out
+# Cofactors of a symmetric (3, 3), row-major: a b - c d of the entries with these indices
+_COFACTORS = np.array(
+    [[4, 2, 1, 2, 0, 1, 1, 1, 0], [8, 5, 5, 5, 8, 2, 5, 2, 4], [5, 1, 2, 1, 2, 0, 2, 0, 1], [5, 8, 4, 8, 2, 5, 4, 5, 1]]
+)
 
 
 @functools.cache
@@ -39,7 +43,7 @@ def minimise(window: Window, of_vehicles: Sequence[Linearised], terms: Sequence[
             _all_at_once(window, of_vehicles, window.layout.ego_poses)
             _all_at_once(window, terms, EGO if hold_ego else slice(0))
             return
-        moved = np.zeros((len(window.velocity), OF_VEHICLE))
+        moved = np.zeros((len(window.velocity), OF_VEHICLE)) if len(of_vehicles) > 1 else None
         for term in of_vehicles:
             _each_vehicle(window, term, moved)
         _egos(window, terms, EGO if hold_ego else None)
@@ -47,10 +51,11 @@ def minimise(window: Window, of_vehicles: Sequence[Linearised], terms: Sequence[
         window.of_egos[:] = np.nan
 
 
-def _each_vehicle(window: Window, term: Linearised, moved: Floats) -> None:
+def _each_vehicle(window: Window, term: Linearised, moved: Floats | None) -> None:
     """Applies edges of single, unconnected vehicles: k systems of d equations instead of one of k d.
 
-    `moved` (M, 8) is the sum of the corrections of each vehicle by earlier terms since the linearization.
+    `moved` (M, 8) is the sum of the corrections of each vehicle by earlier terms since the linearization; None if there
+    is no other term.
     """
     if term.vehicles is None:
         raise ValueError("edges that leave the ego where it is are of single vehicles: `Linearised.vehicles`")
@@ -62,25 +67,31 @@ def _each_vehicle(window: Window, term: Linearised, moved: Floats) -> None:
     if isinstance(J, list):
         HV, HC = V.take(J, axis=1), C.take(J, axis=1)
         S = HV.take(J, axis=2)
-        residual = residual - moved[rows].take(J, axis=1)[:, :, None]
+        if moved is not None:
+            residual = residual - moved[rows].take(J, axis=1)[:, :, None]
     else:
         HV, HC = J @ V, J @ C
-        residual = residual - J @ moved[rows][:, :, None]
+        if moved is not None:
+            residual = residual - J @ moved[rows][:, :, None]
         S = HV @ J.transpose(0, 2, 1)
     S += term.covs
     S.reshape(k, d * d)[:, :: d + 1] += _MIN_VARIANCE
     weights = _inverses(S)
-    if term.gate is not None and _inflate(S, term, term.gate, pose_costs(residual, weights)):
+    weighted = weights @ residual
+    if term.gate is not None and _inflate(S, term, term.gate, (residual * weighted)[:, :, 0].sum(axis=1)):  # Eq. 5
         weights = _inverses(S)
+        weighted = weights @ residual
     gain = HV.transpose(0, 2, 1) @ weights  # P H' S^-1
     gain[:, LASTING] = 0.0
-    corrected = window.of_vehicles[rows] - gain @ HV
+    dx = (HV.transpose(0, 2, 1) @ weighted)[:, :, 0]  # Eq. 8: where the sum of the window's own cost and F is least
+    dx[:, LASTING] = 0.0
+    corrected = V - gain @ HV
     corrected[:, LASTING] = corrected[:, :, LASTING].transpose(0, 2, 1)
     window.of_vehicles[rows] = corrected
     window.with_egos[rows] -= gain @ HC
-    dx = (gain @ residual)[:, :, 0]  # Eq. 8: where the sum of the window's own cost and F is least
     window.shift_vehicles(rows, dx)
-    moved[rows] += dx
+    if moved is not None:
+        moved[rows] += dx
 
 
 def _egos(window: Window, terms: Sequence[Linearised], hold: slice | None) -> None:
@@ -193,8 +204,17 @@ def _add_noise(S: Floats, terms: Sequence[Linearised]) -> None:
 
 def _inverses(covs: Floats) -> Floats:
     """Returns the inverses of (k, d, d). Raises np.linalg.LinAlgError if one is not positive definite."""
-    np.linalg.cholesky(covs)
-    return np.asarray(np.linalg.inv(covs), np.float64)
+    d = covs.shape[1]
+    if d != 3:
+        np.linalg.cholesky(covs)
+        return np.asarray(np.linalg.inv(covs), np.float64)
+    C = covs.reshape(-1, 9)  # the general solution takes as long as the rest of the correction
+    cofactors = C.take(_COFACTORS[0], axis=1) * C.take(_COFACTORS[1], axis=1)
+    cofactors -= C.take(_COFACTORS[2], axis=1) * C.take(_COFACTORS[3], axis=1)
+    det = (C[:, :3] * cofactors[:, :3]).sum(axis=1)
+    if not np.minimum(np.minimum(C[:, 0], cofactors[:, 8]), det).min() > 0.0:  # Sylvester: the leading minors
+        raise np.linalg.LinAlgError
+    return (cofactors / det[:, None]).reshape(-1, 3, 3)
 
 
 def _inflate(blocks: Floats, term: Linearised, gate: float, distances: Floats) -> bool:

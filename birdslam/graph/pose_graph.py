@@ -23,7 +23,6 @@ from birdslam.graph.checkpoint import Checkpoint, CheckpointError, Epoch, pack, 
 from birdslam.graph.edges import PoseEdges, pose_edges
 from birdslam.graph.factors.constant_velocity import twist_growth
 from birdslam.graph.factors.factor import Factor, GraphFrame, Linearised
-from birdslam.graph.factors.lasting_error import relative_sigmas
 from birdslam.graph.factors.standard import standard_factors
 from birdslam.graph.factors.vehicle_detection import VehicleDetections
 from birdslam.graph.graph_config import GraphConfig, check_together
@@ -230,9 +229,11 @@ class PoseGraph:
 
     def _predict(self, frame: GraphFrame, window: Window) -> None:
         """Propagates the window to this frame."""
+        cc = frame.edges.cc
+        assert cc is not None  # only a frame that follows is predicted
+        self._motion = frame.motion = window.motion_since_newest(cc.T_from_to, cc.from_frame)
         for factor in self._predicting:
             factor.predict(frame, window)
-        self._motion = frame.motion
         self._t_before_ns, self._t_ns = self._t_ns, frame.measurements.t_source_ns
 
     def _minimise(self, frame: GraphFrame, window: Window) -> None:
@@ -242,7 +243,7 @@ class PoseGraph:
         joint: list[Linearised] = []
         for factor in self._linearising:
             term = factor.linearise(frame, window)
-            if term is not None and math.isfinite(np.sum(term.residual)):
+            if term is not None and math.isfinite(np.add.reduce(term.residual, axis=None)):
                 terms[factor.name] = term
                 leaves_ego = factor.of_vehicles and not self.config.vehicles_move_ego
                 (alone if leaves_ego else joint).append(term)
@@ -258,9 +259,9 @@ class PoseGraph:
             window.select(rows)
         if started:
             begins = [self._vehicles.begin(cv[k].vehicle, m.frame_id, m.t_source_ns) for k in started]
-            seen = cv_edges(begins, frame.edges.cv_numbers[started])
+            seen = cv_edges(begins, [cv[k] for k in started])
             lasting = math.sqrt(self.config.lasting_share) * seen.factors
-            window.place_vehicles(seen, self._birth_covs(seen.covs[:, 2, 2]), lasting, relative_sigmas(seen))
+            window.place_vehicles(seen, self._birth_covs(seen.covs[:, 2, 2]), lasting, seen.sigma_rel)
 
     def _birth_covs(self, yaw_variances: Floats) -> Floats:
         """Returns the twist covariances (k, 3, 3) of new vehicles, whose mean twist is zero.

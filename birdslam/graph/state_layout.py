@@ -9,7 +9,7 @@ import functools
 
 import numpy as np
 
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Floats, Ints
 
 EGO = slice(0, 3)
 OF_VEHICLE = 8  # numbers of a vehicle
@@ -26,19 +26,11 @@ class StateLayout:
         of_vehicles = first + np.arange(OF_VEHICLE * vehicles, dtype=np.int64).reshape(vehicles, OF_VEHICLE)
         self.of_vehicles = of_vehicles  # (M, 8)
         self.poses, self.twists = of_vehicles[:, POSE], of_vehicles[:, TWIST]  # (M, 3) each
-        # Jacobian of poses relative to the newest ego by its motion, without the lever arm of its turn: (first, 3) of
-        # the ego poses, its own first, and (M, 8, 3) of the vehicles
-        self.egos_against = -np.tile(np.eye(3), (1 + nodes, 1))
-        self.egos_against[EGO] = np.eye(3)
-        self.vehicles_against = np.zeros((vehicles, OF_VEHICLE, 3))
-        self.vehicles_against[:, POSE] = -np.eye(3)
-        self.vehicles_stay = np.tile(np.eye(OF_VEHICLE), (vehicles, 1, 1))  # (M, 8, 8) of stationary vehicles
-        # Jacobian of the ego poses by a motion of the newest one, its own adjoint and the nodes' rotation: index of
-        # each entry in (0, 1, cos, sin, -sin, and the lever arm of the turn, y and -x)
-        self.ego_moves = np.zeros((first, first), dtype=np.int64)
-        for i in range(0, first, 3):
-            self.ego_moves[i : i + 3, i : i + 3] = (2, 4, 0), (3, 2, 0), (0, 0, 1)
-        self.ego_moves[:2, 2] = 5, 6
+        # Derivatives of a stationary vehicle's state (M, 8, 11) by itself and by the ego's motion, whose lever arm is
+        # zero here: the vehicle is relative to the newest ego
+        self.vehicles_stay = np.tile(np.eye(OF_VEHICLE, OF_VEHICLE + 3), (vehicles, 1, 1))
+        self.vehicles_stay[:, POSE, OF_VEHICLE:] = -np.eye(3)
+        self.ego_moves = [_ego_moves(nodes, node) for node in range(nodes)]
 
     @staticmethod
     @functools.lru_cache(maxsize=64)
@@ -50,6 +42,25 @@ class StateLayout:
     def node(k: int) -> slice:
         """The rows of an ego node."""
         return slice(3 + 3 * k, 6 + 3 * k)
+
+
+def _ego_moves(nodes: int, replaced: int) -> Ints:
+    """Index (E, 3 + E) of each derivative of the ego poses by the ego's motion, first, and by the ego poses.
+
+    Into (0, 1, -1, cos, sin, -sin, the lever arm of the turn, y and -x, y of each node, -x of each node). The columns
+    of the `replaced` node are zero: it is the newest ego pose, without error relative to it.
+    """
+    first = 3 + 3 * nodes
+    out = np.zeros((first, 3 + first), dtype=np.int64)
+    for i in range(0, first, 3):
+        out[i : i + 3, 3 + i : 6 + i] = (3, 5, 0), (4, 3, 0), (0, 0, 1)
+        out[i : i + 3, :3] = 2 * np.eye(3, dtype=np.int64)
+    out[:2, 5] = 6, 7
+    out[:3, :3] = np.eye(3, dtype=np.int64)
+    for k in range(nodes):
+        out[3 + 3 * k, 2], out[4 + 3 * k, 2] = 8 + k, 8 + nodes + k
+    out[:, 6 + 3 * replaced : 9 + 3 * replaced] = 0
+    return out
 
 
 def diagonal_blocks(A: Floats, first: int, shape: tuple[int, ...]) -> Floats:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,14 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from birdslam.geometry.arrays import Floats
-from birdslam.graph.costs import rotated
 from birdslam.graph.edges import CvEdges, PoseEdges, VvEdges
-from birdslam.graph.factors.lasting_error import line_of_sight_factors
+from birdslam.graph.factors.lasting_error import line_of_sight_factor
 from birdslam.types import Moves, VehicleEdge
 
 PATH_HALF_WIDTH_M = 1.75  # half a lane, as in vehicles/state/parallax.py
 BESIDE_M = 15.0  # vehicles at a larger lateral distance are on another road or parked: standing.py
 MAX_LOG_HEIGHT = 2.0  # of a vehicle
+MIN_DISTANCE_M = 1e-9  # of a vehicle from the ego
 MIN_INTERVAL_S = 1e-3  # for source clocks that stop or step back
 
 
@@ -56,14 +57,33 @@ class Associations:
     dt_s: Floats  # (M,) since each vehicle's newest pose; 0: no pose in this frame
 
 
-def cv_edges(rows: list[int], numbers: Floats) -> CvEdges:
-    """Returns the edges, in ego, to the vehicles in these rows of the window, from their `numbers` (k, 12)."""
-    at, heading = numbers[:, 0] + 1j * numbers[:, 1], np.exp(1j * numbers[:, 2])
-    covs = rotated(numbers[:, 3:].reshape(-1, 3, 3), heading)
-    return CvEdges(rows, at, heading, covs, line_of_sight_factors(at, covs))
+def cv_edges(rows: list[int], edges: Sequence[VehicleEdge]) -> CvEdges:
+    """Returns the edges, in ego, to the vehicles in these rows of the window."""
+    ats, headings, table = [], [], []
+    for edge in edges:  # for a few vehicles faster than arrays
+        T, (xx, xy, xt, _, yy, yt, _, _, tt) = edge.T_ego_vehicle, edge.cov
+        at, heading = complex(T.x_m, T.y_m), cmath.rect(1.0, T.yaw_rad)
+        mean, deviator = 0.5 * (xx + yy), complex(0.5 * (xx - yy), xy) * (heading * heading)
+        xx, xy, yy, with_yaw = mean + deviator.real, deviator.imag, mean - deviator.real, complex(xt, yt) * heading
+        xt, yt, distance_m = with_yaw.real, with_yaw.imag, max(abs(at), MIN_DISTANCE_M)
+        along, across = line_of_sight_factor(at / distance_m, mean, deviator)
+        ats.append(at)
+        headings.append(heading)
+        factor = along.real, across.real, along.imag, across.imag
+        sigma_rel = abs(along) / distance_m, abs(across) / distance_m
+        table.append((xx, xy, xt, xy, yy, yt, xt, yt, tt, *factor, *sigma_rel))
+    numbers = np.array(table, np.float64).reshape(-1, 15)
+    return CvEdges(
+        rows,
+        np.array(ats, np.complex128),
+        np.array(headings, np.complex128),
+        numbers[:, :9].reshape(-1, 3, 3),
+        numbers[:, 9:13].reshape(-1, 2, 2),
+        numbers[:, 13:],
+    )
 
 
-NO_CV = cv_edges([], np.zeros((0, 12)))
+NO_CV = cv_edges([], ())
 NO_VV = VvEdges([], np.zeros(0), np.zeros(0, np.complex128), np.zeros(0), np.zeros((0, 3, 3)))
 
 
@@ -107,7 +127,7 @@ class VehicleNodes:
             v.node_frame, v.node_ns = frame, t_ns
         cv, vv = NO_CV, NO_VV
         if known:
-            cv = cv_edges([rows[k] for k in known], _some(edges.cv_numbers, known))
+            cv = cv_edges([rows[k] for k in known], [edges.cv[k] for k in known])
         if linked:
             by_vv, of_vv = [row for row, _ in linked], _some(edges.vv_numbers, [k for _, k in linked])
             at, covs = of_vv[:, 0] + 1j * of_vv[:, 1], of_vv[:, 3:].reshape(-1, 3, 3)

@@ -159,6 +159,13 @@ class Window:
 
     # --- propagation ---
 
+    def motion_since_newest(self, motion: SE2, from_frame: int) -> SE2:
+        """Returns the ego's motion since the newest frame, from that since `from_frame`, a pose of the window."""
+        if from_frame == self.frame:
+            return motion
+        base = self.node_frames.index(from_frame)
+        return _se2(self.at[base], self.heading[base]) @ motion
+
     def propagate(
         self,
         motion: SE2,
@@ -167,103 +174,123 @@ class Window:
         to_frame: int,
         dt_s: Floats,
         twist_growth: Sequence[float],
-    ) -> SE2:
-        """Propagates the ego by `motion` with `cov` (3, 3) from the frame `from_frame`: the CC edge of Eq. 2.
+        kept: Floats | None = None,
+    ) -> None:
+        """Propagates the ego by `motion`, since the newest frame: the CC edge of Eq. 2.
 
-        Each vehicle is propagated over `dt_s` (M,) with its twist, whose variances grow by `twist_growth` (3,) per
-        second: the constant-velocity factor. A vehicle with `dt_s` 0 keeps its pose. Returns the ego's motion since the
-        newest frame.
+        The edge, with `cov` (3, 3), starts at the frame `from_frame`. Each vehicle is propagated over `dt_s` (M,) with
+        its twist, whose variances grow by `twist_growth` (3,) per second: the constant-velocity factor. A vehicle with
+        `dt_s` 0 keeps its pose. Of the lasting errors the fractions `kept` (M, 2) remain, the rest is new.
         """
         node = self._replace_oldest_node()
-        base = self.node_frames.index(from_frame)
-        T_ego_next = motion if base == node else _se2(self.at[base], self.heading[base]) @ motion
-        self.world = self.world @ T_ego_next  # Eq. 2 with residual zero
-        back = cmath.rect(1.0, -T_ego_next.yaw_rad)
-        F = self._move_poses(T_ego_next, back, dt_s)
-        if any(twist_growth) and len(dt_s):
-            self._variances[:, TWIST] += np.outer(dt_s, twist_growth)
+        self.world = self.world @ motion  # Eq. 2 with residual zero
+        F = self._move_poses(motion, dt_s)
+        if kept is not None:
+            F[:, LASTING, LASTING] *= kept[:, None]
         if node == 0:  # once in `nodes` frames, against the accumulation of rounding errors
             self.of_egos = 0.5 * (self.of_egos + self.of_egos.T)
             self.of_vehicles = 0.5 * (self.of_vehicles + self.of_vehicles.transpose(0, 2, 1))
             self.heading /= np.abs(self.heading)
-        self._move_errors(T_ego_next, back, F)
-        self._add_motion_noise(cov, None if base == node else base)
+        if any(twist_growth) and len(dt_s):
+            self._variances[:, TWIST] += dt_s[:, None] * twist_growth
+        J, base = self._ego_transition(motion, node), self.node_frames.index(from_frame)
+        if base == node:
+            self._move_errors(J, F, cov)
+        else:
+            self._move_errors(J, F, np.zeros((3, 3)))
+            self._add_motion_noise(J[:, :3], F[:, :, OF_VEHICLE:], cov, base)
+        if kept is not None:
+            self._variances[:, LASTING] = 1.0
         self.frame, self.next_node = to_frame, (node + 1) % self.nodes
-        return T_ego_next
 
     def _replace_oldest_node(self) -> int:
-        """Replaces the oldest node, which is marginalized, by the newest ego pose; returns the index of the node."""
+        """Replaces the oldest node, which is marginalized, by the newest ego pose; returns the index of the node.
+
+        Its error is set in `_ego_transition`.
+        """
         node = self.next_node
-        rows = StateLayout.node(node)
         self.at[node], self.heading[node] = 0j, 1.0 + 0j  # relative to the newest ego pose, which is the same
-        self.of_egos[rows] = self.of_egos[:, rows] = 0.0  # without error
-        self.with_egos[:, :, rows] = 0.0
         self.node_frames[node] = self.frame
         return node
 
-    def _move_poses(self, T_ego_next: SE2, back: complex, dt_s: Floats) -> Floats:
-        """Expresses all poses relative to the next ego pose, whose axes are turned by `back`, and propagates vehicles.
+    def _move_poses(self, T_ego_next: SE2, dt_s: Floats) -> Floats:
+        """Expresses all poses relative to the next ego pose and propagates vehicles.
 
-        Returns the transition matrices (M, 8, 8) of the vehicles' errors.
+        Returns the derivatives (M, 8, 11) of each vehicle's next state by its state and by the ego's motion.
         """
+        n, back = self.nodes, cmath.rect(1.0, -T_ego_next.yaw_rad)
         self.at = (self.at - complex(T_ego_next.x_m, T_ego_next.y_m)) * back
         self.heading = self.heading * back
-        F = self.layout.vehicles_stay.copy()
-        if not len(F):
-            return F
-        n = self.nodes
+        if not len(dt_s):
+            return self.layout.vehicles_stay
         way, self.heading[n:], g, d = advance(self.heading[n:], self.velocity, self.turn_radps, dt_s)
         self.at[n:] += way
-        place = np.empty((len(F), TWIST.stop), np.complex128)  # x + iy of the next place by pose and twist
-        place[:, :2] = back, 1j * back
-        place[:, 2], place[:, 3], place[:, 5] = 1j * way, g, d
-        place[:, 4] = 1j * g
-        F[:, 0, : TWIST.stop], F[:, 1, : TWIST.stop], F[:, 2, 5] = place.real, place.imag, dt_s
+        F = self.layout.vehicles_stay.copy()
+        place = np.zeros((len(F), F.shape[2]), np.complex128)  # x + iy of the next place
+        place[:, :2], place[:, 2] = (back, 1j * back), 1j * way  # by the pose
+        place[:, 3], place[:, 4], place[:, 5] = g, 1j * g, d  # by the twist
+        place[:, 8:10], place[:, 10] = (-1.0, -1j), -1j * self.at[n:]  # by the ego's motion
+        F[:, :2] = place.view(np.float64).reshape(*place.shape, 2).transpose(0, 2, 1)
+        F[:, 2, 5] = dt_s
         return F
 
-    def _move_errors(self, T_ego_next: SE2, back: complex, F: Floats) -> None:
-        """Propagates P: J P J' with a block-diagonal J."""
-        T, c, s = T_ego_next.inverse(), back.real, back.imag
-        J = np.array((0.0, 1.0, c, s, -s, T.y_m, -T.x_m)).take(self.layout.ego_moves)
-        self.of_egos = J @ self.of_egos @ J.T
+    def _ego_transition(self, T_ego_next: SE2, node: int) -> Floats:
+        """Returns the derivatives (E, 3 + E) of the next ego poses by the ego's motion and by the ego poses.
+
+        The replaced `node` starts without error.
+        """
+        T, turn = T_ego_next.inverse(), T_ego_next.yaw_rad
+        c, s = math.cos(turn), -math.sin(turn)
+        at = self.at[: self.nodes]
+        values = 0.0, 1.0, -1.0, c, s, -s, T.y_m, -T.x_m, *at.imag.tolist(), *(-at.real).tolist()
+        return np.array(values).take(self.layout.ego_moves[node])
+
+    def _move_errors(self, J: Floats, F: Floats, cov: Floats) -> None:
+        """Propagates P with the transitions of ego poses and vehicles, and the noise `cov` (3, 3) of the ego's motion.
+
+        The motion is a further state with this covariance, which all poses relative to the ego have in common.
+        """
+        E, (B, size, _) = len(J), self.of_vehicles.shape
+        P = np.zeros((3 + E, 3 + E))
+        P[:3, :3], P[3:, 3:] = cov, self.of_egos
+        self.of_egos = J @ P @ J.T
         if not len(F):
             return
-        E, (B, n, _) = len(J), self.of_vehicles.shape
-        self.with_egos = ((F @ self.with_egos).reshape(-1, E) @ J.T).reshape(-1, OF_VEHICLE, E)
-        F = F.reshape(B, -1, OF_VEHICLE, OF_VEHICLE)
-        for _ in range(2):  # F V, and then F (F V)' = F V F'
-            moved = F @ self.of_vehicles.reshape(B, -1, OF_VEHICLE, n)
-            self.of_vehicles = moved.reshape(B, n, n).transpose(0, 2, 1)
-        self.of_vehicles = np.ascontiguousarray(self.of_vehicles)
+        M, n = F.shape[0], F.shape[2]
+        C = np.zeros((M, n, 3 + E))
+        C[:, :OF_VEHICLE, 3:], C[:, OF_VEHICLE:, :3] = self.with_egos, cov
+        self.with_egos = ((F @ C).reshape(-1, 3 + E) @ J.T).reshape(M, OF_VEHICLE, E)
+        if not self.together:
+            V = np.zeros((M, n, n))
+            V[:, :OF_VEHICLE, :OF_VEHICLE], V[:, OF_VEHICLE:, OF_VEHICLE:] = self.of_vehicles, cov
+            self.of_vehicles = F @ V @ F.transpose(0, 2, 1)
+            return
+        F, G = F[:, :, :OF_VEHICLE], np.ascontiguousarray(F[:, :, OF_VEHICLE:]).reshape(size, 3)
+        FV = (F @ self.of_vehicles.reshape(M, OF_VEHICLE, size)).reshape(size, size)
+        moved = (F @ FV.T.reshape(M, OF_VEHICLE, size)).reshape(size, size)  # F (F V)' = F V F'
+        self.of_vehicles = (moved + G @ cov @ G.T).reshape(B, size, size)
 
-    def _add_motion_noise(self, cov: Floats, base: int | None) -> None:
-        """Adds the noise `cov` (3, 3) of the ego's motion to all states relative to the ego.
+    def _add_motion_noise(self, G: Floats, G_vehicles: Floats, cov: Floats, base: int) -> None:
+        """Adds the noise `cov` (3, 3) of a motion that starts at the node `base`, and the error of that node.
 
-        If the motion starts at the node `base` instead of the newest pose, the error of that node is added too.
+        `G` (E, 3) and `G_vehicles` (M, 8, 3) are the derivatives of the states by the ego's motion.
         """
-        layout, n, (B, size, _) = self.layout, self.nodes, self.of_vehicles.shape
-        G, G_vehicles = layout.egos_against.copy(), layout.vehicles_against.copy()
-        G[3::3, 2], G[4::3, 2] = self.at[:n].imag, -self.at[:n].real
-        G_vehicles[:, 0, 2], G_vehicles[:, 1, 2] = self.at[n:].imag, -self.at[n:].real
-        moved = [(G, G_vehicles, cov)]
-        if base is not None:
-            there = StateLayout.node(base)
-            of_node = np.linalg.inv(-G[there])
-            G_base, G_base_vehicles = G @ of_node, G_vehicles @ of_node
-            moved.append((G_base, G_base_vehicles, self.of_egos[there, there].copy()))
-            in_common, with_node = self.with_egos[:, :, there], self.of_egos[there].copy()
-            more = G_base_vehicles.reshape(B, size, 3) @ in_common.reshape(B, size, 3).transpose(0, 2, 1)
-            self.of_vehicles += more + more.transpose(0, 2, 1)
-            self.with_egos = self.with_egos + G_base_vehicles @ with_node + in_common @ G_base.T
-            more = G_base @ with_node
-            self.of_egos += more + more.T
+        B, size, _ = self.of_vehicles.shape
+        there = StateLayout.node(base)
+        of_node = np.linalg.inv(-G[there])
+        G_base, G_base_vehicles = G @ of_node, G_vehicles @ of_node
+        moved = (G, G_vehicles, cov), (G_base, G_base_vehicles, self.of_egos[there, there].copy())
+        in_common, with_node = self.with_egos[:, :, there], self.of_egos[there].copy()
+        more = G_base_vehicles.reshape(B, size, 3) @ in_common.reshape(B, size, 3).transpose(0, 2, 1)
+        self.of_vehicles += more + more.transpose(0, 2, 1)
+        self.with_egos = self.with_egos + G_base_vehicles @ with_node + in_common @ G_base.T
+        more = G_base @ with_node
+        self.of_egos += more + more.T
         for of_egos, of_vehicles, C in moved:
             self.of_egos += of_egos @ C @ of_egos.T
-            if len(of_vehicles):
-                noise = of_vehicles @ C
-                self.with_egos += (noise.reshape(-1, 3) @ of_egos.T).reshape(self.with_egos.shape)
-                blocks = of_vehicles.reshape(B, size, 3)
-                self.of_vehicles += noise.reshape(B, size, 3) @ blocks.transpose(0, 2, 1)
+            self.with_egos += of_vehicles @ C @ of_egos.T
+            blocks = of_vehicles.reshape(B, size, 3)
+            self.of_vehicles += blocks @ C @ blocks.transpose(0, 2, 1)
 
     def drift(self, along: complex, variance: float, across_variance: float) -> None:
         """Adds variances (m^2) along and across the unit vector `along` in ego to the position of the ego in world.
@@ -322,16 +349,6 @@ class Window:
         self._renew(seen.rows, LASTING, np.eye(2))
         self._relate(seen.rows, PLACE, LASTING, -lasting)  # the position is the edge minus its error
         self.sigma_rel[seen.rows] = sigma_rel
-
-    def fade_lasting(self, rows: Sequence[int], kept: Floats, sigma_rel: Floats) -> None:
-        """Keeps the fraction `kept` (k, 2) of the lasting errors of vehicles `rows` (k,); the rest is new."""
-        factor = np.ones((len(self.velocity), OF_VEHICLE))
-        factor[rows, LASTING] = kept
-        own = factor.reshape(self.of_vehicles.shape[:2])
-        self.with_egos *= factor[:, :, None]
-        self.of_vehicles *= own[:, :, None] * own[:, None]
-        self._variances[:, LASTING] = 1.0
-        self.sigma_rel[rows] = sigma_rel
 
     def set_twists(self, rows: Sequence[int], velocity: Complexes | Floats, turn_radps: Floats, covs: Floats) -> None:
         """Sets the twists of vehicles `rows` (k,) with `covs` (k, 3, 3), uncorrelated with all other states."""

@@ -34,6 +34,7 @@ class GraphFrame:
     passed_s: float = 0.0  # since the newest pose of the window
     twist_growth: Triple = (0.0, 0.0, 0.0)  # of the variances of vehicles' twists in a second
     fixed: Sequence[int] = ()  # rows of stationary vehicles, whose position in world is not propagated
+    kept: Floats | None = None  # (M, 2) fractions of the vehicles' lasting errors that last; None: all
     motion: SE2 = _NONE  # of the ego since the previous frame
     settled: Sequence[tuple[float, float]] = ()  # landmarks to be added to the map, metres in world
 

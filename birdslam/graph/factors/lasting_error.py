@@ -7,33 +7,26 @@ the line of sight. They are considered, not estimated (Schmidt 1966); see docs/m
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from birdslam.geometry.arrays import Complexes, Floats
-from birdslam.graph.edges import CvEdges
+from birdslam.geometry.arrays import Floats
 
 DRIVING_MPS = 1.0  # the view changes well above this speed (as in vehicles/state/ground_size_config.py)
 _MIN_M2 = 1e-12
 
 
-def line_of_sight_factors(at: Complexes, covs: Floats) -> Floats:
-    """Factors F (k, 2, 2) of the position covariances FF' in `covs` (k, 3, 3); column 0 is along the line of sight."""
-    along = at / np.maximum(np.abs(at), 1e-9)
-    axes = np.array([[along.real, -along.imag], [along.imag, along.real]]).transpose(2, 0, 1)
-    C = axes.transpose(0, 2, 1) @ covs[:, :2, :2] @ axes
-    L = np.zeros(C.shape)  # Cholesky factor; C may be singular
-    L[:, 0, 0] = np.sqrt(np.maximum(C[:, 0, 0], _MIN_M2))
-    L[:, 1, 0] = C[:, 1, 0] / L[:, 0, 0]
-    L[:, 1, 1] = np.sqrt(np.maximum(C[:, 1, 1] - np.square(L[:, 1, 0]), _MIN_M2))
-    out: Floats = axes @ L
-    return out
+def line_of_sight_factor(along: complex, mean: float, deviator: complex) -> tuple[complex, complex]:
+    """Columns, as x + iy, of the factor F of a position covariance FF' with this mean and deviator (costs.py).
 
-
-def relative_sigmas(edges: CvEdges) -> Floats:
-    """1-sigma (k, 2) of the edges' positions along and across the line of sight, as fractions of the distance."""
-    distance_m = np.maximum(np.abs(edges.at), 1e-9)
-    out: Floats = np.sqrt(np.square(edges.factors).sum(axis=1)) / distance_m[:, None]
-    return out
+    The first is along the line of sight, a unit number. The covariance may be singular.
+    """
+    deviator *= (along * along).conjugate()
+    L = math.sqrt(max(mean + deviator.real, _MIN_M2))  # Cholesky factor in the axes of the line of sight
+    aside = deviator.imag / L
+    across = math.sqrt(max(mean - deviator.real - aside * aside, _MIN_M2))
+    return along * complex(L, aside), along * complex(0.0, across)
 
 
 def lasting_correlation(sigma_rel: Floats, sigma_before_rel: Floats, driven_s: Floats, memory_s: float) -> Floats:

@@ -47,8 +47,8 @@ class Odometry(Factor):
         cov = np.zeros((3, 3)) if frame.zero_velocity else np.reshape(cc.cov, (3, 3))
         dt_s = frame.associations.dt_s.copy()
         dt_s[[*frame.fixed]] = 0.0
-        frame.motion = window.propagate(  # Eq. 6: its CC edge
-            cc.T_from_to, cov, cc.from_frame, m.frame_id, dt_s, frame.twist_growth
+        window.propagate(  # Eq. 6: its CC edge
+            frame.motion, cov, cc.from_frame, m.frame_id, dt_s, frame.twist_growth, frame.kept
         )
         if not frame.zero_velocity:
             self._drift(frame.motion, window, m.scale_sigma_rel)

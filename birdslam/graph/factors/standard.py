@@ -6,7 +6,7 @@ from birdslam.graph.factors.constant_velocity import ConstantVelocity
 from birdslam.graph.factors.factor import Factor
 from birdslam.graph.factors.landmark_points import LandmarkPoints
 from birdslam.graph.factors.odometry import Odometry
-from birdslam.graph.factors.vehicle_detection import VehicleDetections
+from birdslam.graph.factors.vehicle_detection import LastingErrors, VehicleDetections
 from birdslam.graph.factors.vehicle_landmarks import VehicleLandmarks
 from birdslam.graph.factors.vehicle_motion import MeasuredTwist, VehicleMotion
 from birdslam.graph.graph_config import GraphConfig
@@ -21,6 +21,8 @@ def standard_factors(config: GraphConfig, weights: WeightsConfig) -> list[Factor
         factors = [ConstantVelocity(config), odometry, detections, MeasuredTwist()]
     else:
         factors = [VehicleMotion(), odometry, detections]
+    if config.lasting_share:
+        factors.insert(1, LastingErrors(config))
     if weights.cp_vehicles is not None:
         factors.append(VehicleLandmarks(weights.cp_vehicles, landmarks))
     return [*factors, landmarks]
