@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -10,8 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from birdslam.geometry.camera import Camera
+from birdslam.perception import Networks, Segmentation
+from birdslam.perception.decoding.multitask import Findings
+from birdslam.perception.manifest import Schedule
+from birdslam.runtime.calibration.kept import KeptResults
 from birdslam.runtime.calibration.pieces import READ_S, pieces, read_pieces
 from birdslam.sources.recording import RecordedFrame, Recording
+from birdslam.types import Frame
 
 CAMERA = Camera(8, 4, 6.0, 6.0, 4.0, 2.0, 1.5)
 
@@ -61,3 +67,34 @@ def test_frames_keep_their_index_and_time() -> None:
 def test_a_film_that_is_shorter_than_declared_ends_where_it_ends(declared: int) -> None:
     film = Film(30, 10.0, declared)
     assert len(list(read_pieces(film, pieces(film, None), "test"))) == 30
+
+
+class _Masks:
+    """A network whose masks and boxes depend on the image; counts its runs."""
+
+    name, role, schedule, fell_back = "masks", "segmenter", Schedule(every=2), ""
+
+    def __init__(self) -> None:
+        self.runs = 0
+
+    def run(self, image: np.ndarray) -> Findings:
+        self.runs += 1
+        mask = np.arange(image.size).reshape(image.shape) % (2 + int(image[0, 0])) == 0
+        return Findings(segmentation=Segmentation(mask, ~mask))
+
+
+def test_second_pass_has_the_networks_results_of_the_first() -> None:
+    head = _Masks()
+    with ThreadPoolExecutor(1) as threads:
+        results = KeptResults(Networks([head], threads.submit))
+        passes = []
+        for _ in range(2):
+            frames = [Frame(k, k, k, 0, np.full((5, 7), k % 3, np.uint8)) for k in range(9)]
+            passes.append([pending.result() for _, pending in results.of_frames(frames)])
+    assert head.runs == 5
+    for first, second in zip(*passes, strict=True):
+        assert (first.ages, first.status, first.detections) == (second.ages, second.status, second.detections)
+        assert first.segmentation is not None
+        assert second.segmentation is not None
+        np.testing.assert_array_equal(first.segmentation.road, second.segmentation.road)
+        np.testing.assert_array_equal(first.segmentation.lane, second.segmentation.lane)

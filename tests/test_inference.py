@@ -6,10 +6,12 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from itertools import islice
 
 import numpy as np
 import pytest
 
+from birdslam import open_recording
 from birdslam.perception import Findings, ModelSpec
 from birdslam.runtime.configuration import Configuration, ModelsConfig, PerceiveConfig, SourceConfig
 from birdslam.runtime.nodes import inference
@@ -159,3 +161,28 @@ def test_at_rate_max_there_is_no_background_work(made: Made) -> None:
         assert networks.run_in_background is None
         networks.start(frame(0))
         networks.lane_head.yield_core()  # at once: lanes are found within the frame
+
+
+def test_boxes_alone_are_those_of_the_whole_network() -> None:
+    """The shipped network computes masks with its boxes; without them the boxes are bit-identical."""
+    configuration = Configuration(source=SourceConfig(rate="max"))
+    recording = open_recording("demo")
+    images = [shown.image for shown in islice(recording.undistorted_frames(), 3)]
+    found = []
+    for boxes_only in (False, True):
+        with Inference(configuration, boxes_only) as networks:
+            seen = [networks.start(Frame(k, 0, 0, 0, image)).result() for k, image in enumerate(images)]
+        found.append([result.detections for result in seen])
+    for whole, boxes in zip(*found, strict=True):
+        assert whole is not None
+        assert boxes is not None
+        np.testing.assert_array_equal(whole.boxes_px, boxes.boxes_px)
+        np.testing.assert_array_equal(whole.scores, boxes.scores)
+
+
+def test_boxes_alone_need_only_the_detector(monkeypatch: pytest.MonkeyPatch) -> None:
+    spec = ModelSpec("none.onnx")
+    monkeypatch.setattr(inference, "load_network", lambda role, spec, *others: Head(role))
+    models = ModelsConfig(detector=spec, segmenter=spec, shipped=False)
+    with Inference(Configuration(source=SourceConfig(rate="max"), models=models), boxes_only=True) as networks:
+        assert networks.roles == {"detector"}

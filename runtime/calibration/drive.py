@@ -27,6 +27,7 @@ from birdslam.runtime.calibration.height import (
     lengths_by,
     with_height,
 )
+from birdslam.runtime.calibration.kept import KeptResults
 from birdslam.runtime.calibration.lens import corners_of_drive, lens_of_drive
 from birdslam.runtime.calibration.pieces import pieces, read_pieces
 from birdslam.runtime.calibration.report import report
@@ -90,10 +91,10 @@ def calibrate_drive(
     configuration = configuration.as_lossless()
     config = msgspec.structs.replace(config, known_lane_m=given.size.lane_m, known_vehicle_m=given.size.car_height_m)
     with Inference(configuration) as inference:
+        results = KeptResults(inference.networks)
 
         def drive() -> Iterator[tuple[Frame, Pending]]:
-            frames = read_pieces(recording, pieces(recording, most_frames), "calibrate")
-            return inference.networks.in_order(frames)
+            return results.of_frames(read_pieces(recording, pieces(recording, most_frames), "calibrate"))
 
         try:
             found = calibrate(

@@ -114,7 +114,7 @@ def corners_of_drive(
     recording = open_recorded(uri, raw, stride, configuration.source.topics)
     read = pieces(recording, configuration.source.frames)
     every = max(1, sum(map(len, read)) // MAX_IMAGES)
-    with Inference(complete(configuration, raw, recording.rate_hz)) as inference:
+    with Inference(complete(configuration, raw, recording.rate_hz), boxes_only=True) as inference:
 
         def images() -> Iterator[tuple[NDArray[np.uint8], Floats, float]]:
             frames = read_pieces(recording, read, "lens")

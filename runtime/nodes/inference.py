@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import statistics
+import sys
 import threading
 import time
 from collections import deque
@@ -56,7 +57,8 @@ class Inference(Closing):
     so do the lanes. Raises perception.ModelError.
     """
 
-    def __init__(self, configuration: Configuration) -> None:
+    def __init__(self, configuration: Configuration, boxes_only: bool = False) -> None:
+        """With `boxes_only` only the boxes of road users are computed, bit-identical."""
         schedule, looks = configuration.perceive.schedule, configuration.perceive.looks
         specs = {role: schedule.of(role, spec) for role, spec in configuration.models.in_use().items()}
         self._adapts = looks.adaptive and not configuration.lossless
@@ -67,8 +69,11 @@ class Inference(Closing):
         boxes = source_detections(configuration)
         if boxes is not None:
             specs.pop("detector", None)
+        if boxes_only:
+            role = "detector" if "detector" in specs else "multitask"
+            specs = {role: specs[role]} if role in specs and boxes is None else {}
         whole = boxes is not None or chosen or bool({"detector", "segmenter"} & specs.keys())
-        apart = APART if self._adapts and not whole else ()
+        apart = APART if boxes_only or (self._adapts and not whole) else ()
         specs = self._computed_by(specs, configuration, max_threads)
         heads = [load_network(role, spec, max_threads, unread, apart) for role, spec in specs.items()]
         for head in heads:
@@ -78,7 +83,8 @@ class Inference(Closing):
         self._lanes_every = schedule.lanes.every or 1
         self.frustum_network: PointNet | None = None if pointnet is None else load_pointnet(pointnet)
         self.completion: GridCompletion | None = None  # of lane grids
-        if configuration.models.completion and any("segmenter" in ROLES.get(h.role, (h.role,)) for h in heads):
+        finds_road = any("segmenter" in ROLES.get(h.role, (h.role,)) for h in heads) and not boxes_only
+        if configuration.models.completion and finds_road:
             self.completion = shipped_completion(configuration.slam.frontend.lanes.shape)
         self._deadline_ns = configuration.deadline_ns
         # Within this share of the budget a mode of degradation can end
@@ -108,6 +114,8 @@ class Inference(Closing):
             boxes_alone=self._boxes_alone,
             detections=boxes,
         )
+        if boxes_only:
+            self.networks.masks_every = sys.maxsize
 
     @staticmethod
     def _computed_by(
