@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
 
 from birdslam.geometry.camera import Undistorter
@@ -29,11 +30,22 @@ def pieces(recording: Recording, most_frames: int | None) -> list[range]:
 
 
 def read_pieces(recording: Recording, read: Sequence[range], what: str) -> Iterator[Frame]:
-    """Yields the undistorted frames of the pieces, with their index in the recording, and shows the progress."""
+    """Yields the undistorted frames of the pieces, with their index in the recording, and shows the progress.
+
+    Each frame is decoded while the caller processes the one before.
+    """
+    frames = _frames(recording, read)
+    with Progress(what, sum(map(len, read)), "frames") as progress, ThreadPoolExecutor(1, "decoder") as decoder:
+        coming = decoder.submit(next, frames, None)
+        while (frame := coming.result()) is not None:
+            coming = decoder.submit(next, frames, None)
+            yield frame
+            progress.advance()
+
+
+def _frames(recording: Recording, read: Sequence[range]) -> Iterator[Frame]:
     undistort = Undistorter(recording.camera)
-    with Progress(what, sum(map(len, read)), "frames") as progress:
-        for piece in read:
-            recorded = islice(recording.frames_with_speeds(piece.start), len(piece))
-            for index, frame in zip(piece, recorded, strict=False):
-                yield to_frame(undistort, index, frame, frame.t_source_ns)
-                progress.advance()
+    for piece in read:
+        recorded = islice(recording.frames_with_speeds(piece.start), len(piece))
+        for index, frame in zip(piece, recorded, strict=False):
+            yield to_frame(undistort, index, frame, frame.t_source_ns)
