@@ -298,7 +298,9 @@ class Window:
         Poses relative to the ego do not change.
         """
         c, s = along.real, along.imag
-        self.of_egos[:2, :2] += variance * np.outer((c, s), (c, s)) + across_variance * np.outer((-s, c), (-s, c))
+        xy = (variance - across_variance) * c * s
+        xx, yy = variance * c * c + across_variance * s * s, variance * s * s + across_variance * c * c
+        self.of_egos[:2, :2] += ((xx, xy), (xy, yy))
 
     def turn_drift(self, variance: float) -> None:
         """Adds a variance (rad^2) to the yaw of the ego in world."""

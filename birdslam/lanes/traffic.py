@@ -134,15 +134,12 @@ class Traffic:
             odds -= ALONG_EVIDENCE * _speed_sigmas(user)
         right = _probability(self._right)
         (far, far_beyond), (near, near_beyond) = FAR_SIDE, NEAR_SIDE
-
-        def oncoming(at_right: float, at_left: float) -> float:
-            return _with_odds(right * at_right + (1.0 - right) * at_left, odds)
-
-        return TrafficPrior(
-            moving,
-            (oncoming(far, near), oncoming(far_beyond, near_beyond)),
-            (oncoming(near, far), oncoming(near_beyond, far_beyond)),
-        )
+        left_side = near + right * (far - near), near_beyond + right * (far_beyond - near_beyond)
+        right_side = far + right * (near - far), far_beyond + right * (near_beyond - far_beyond)
+        if odds:
+            left_side = _with_odds(left_side[0], odds), _with_odds(left_side[1], odds)
+            right_side = _with_odds(right_side[0], odds), _with_odds(right_side[1], odds)
+        return TrafficPrior(moving, left_side, right_side)
 
     def _moving_log_odds(self, seen: Between) -> float:
         """Log odds of moving from other users beyond the same line, weighted by lateral distance."""
