@@ -21,9 +21,19 @@ from birdslam.odometry.dead_reckoning import DeadReckoning
 from birdslam.odometry.external import ExternalConfig
 from birdslam.odometry.odometry import Motion, Odometry, OdometryConfig
 from birdslam.odometry.plausibility import PlausibilityConfig, PlausibilityGate
-from birdslam.people.people_records import followed_people
-from birdslam.people.people_tracker import PeopleTracker, PeopleTrackingConfig
 from birdslam.perception import Perception
+from birdslam.road_users.camera_height import CameraHeightConfig, CameraHeightEstimator
+from birdslam.road_users.out_of_sequence import OpenFrame, OutOfSequenceConfig, OutOfSequenceTracker
+from birdslam.road_users.people.people_records import followed_people
+from birdslam.road_users.people.people_tracker import PeopleTracker, PeopleTrackingConfig
+from birdslam.road_users.placement.depth_fusion import PseudoLidarConfig
+from birdslam.road_users.placement.localisation import LocalisationConfig
+from birdslam.road_users.placement.pseudolidar import FrustumNetwork
+from birdslam.road_users.state.ground_size_config import GroundSizeConfig
+from birdslam.road_users.state.ground_size_filter import GroundSizeFilter
+from birdslam.road_users.track import EgoFrame, TrackingConfig
+from birdslam.road_users.tracking import Tracker
+from birdslam.road_users.vehicle_edges import vehicle_edges
 from birdslam.types import (
     FIRST_PERSON,
     NS_PER_S,
@@ -37,16 +47,6 @@ from birdslam.types import (
     Status,
     VehicleEdge,
 )
-from birdslam.vehicles.camera_height import CameraHeightConfig, CameraHeightEstimator
-from birdslam.vehicles.out_of_sequence import OpenFrame, OutOfSequenceConfig, OutOfSequenceTracker
-from birdslam.vehicles.placement.depth_fusion import PseudoLidarConfig
-from birdslam.vehicles.placement.localisation import LocalisationConfig
-from birdslam.vehicles.placement.pseudolidar import FrustumNetwork
-from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
-from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
-from birdslam.vehicles.track import EgoFrame, TrackingConfig
-from birdslam.vehicles.tracking import Tracker
-from birdslam.vehicles.vehicle_edges import vehicle_edges
 
 MAX_GAP_NS = 5 * NS_PER_S  # between two frames; no filter can predict over a longer time
 MEASURED_SIGMA_REL = 0.05  # a height or lens with a smaller sigma counts as measured

@@ -11,10 +11,10 @@ from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.weights import PAPER_WEIGHTS
 from birdslam.odometry.odometry import OdometryConfig
 from birdslam.odometry.scale_config import RoadScaleConfig
+from birdslam.road_users.placement.depth_fusion import PseudoLidarConfig
+from birdslam.road_users.placement.localisation import LocalisationConfig
+from birdslam.road_users.state.ground_size_config import GroundSizeConfig
 from birdslam.slam import SlamConfig
-from birdslam.vehicles.placement.depth_fusion import PseudoLidarConfig
-from birdslam.vehicles.placement.localisation import LocalisationConfig
-from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
 
 NO_GATE = 1e6  # sigmas; accepts every edge
 

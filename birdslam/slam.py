@@ -15,9 +15,9 @@ from birdslam.lanes.amodal.lane_mapper import LaneHead
 from birdslam.perception import Networks, shipped_networks
 from birdslam.perception.completion import shipped_completion
 from birdslam.perception.decoding.detection import Detections
+from birdslam.road_users.placed_boxes import PlacedBox, place_boxes
+from birdslam.road_users.placement.pseudolidar import FrustumNetwork
 from birdslam.types import Estimate, Frame, MapUpdate, Measurements
-from birdslam.vehicles.placed_boxes import PlacedBox, place_boxes
-from birdslam.vehicles.placement.pseudolidar import FrustumNetwork
 
 LANES_HZ = 5.0  # default rate of lane detection (`[perceive.schedule]`)
 

@@ -8,7 +8,7 @@ from birdslam.geometry import bev
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
-from birdslam.vehicles.placement.localisation import DIMENSIONS
+from birdslam.road_users.placement.localisation import DIMENSIONS
 from tests.recordings import KITTI
 
 CAR = DIMENSIONS["car"]

@@ -11,9 +11,9 @@ from birdslam.geometry.camera import Camera
 from birdslam.perception import Boxes3d, Detections, Findings, Networks
 from birdslam.perception.decoding.detection import with_bodies
 from birdslam.perception.shipped import run_at_once
-from birdslam.vehicles.placement.depth_fusion import PseudoLidarConfig
-from birdslam.vehicles.placement.localisation import LocalisationConfig, observe_boxes
-from birdslam.vehicles.placement.pseudolidar import locate_detected_bodies
+from birdslam.road_users.placement.depth_fusion import PseudoLidarConfig
+from birdslam.road_users.placement.localisation import LocalisationConfig, observe_boxes
+from birdslam.road_users.placement.pseudolidar import locate_detected_bodies
 from tests.heads import Head
 
 CAMERA = Camera(1242, 375, 720.0, 720.0, 620.0, 180.0, height_m=1.65)

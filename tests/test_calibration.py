@@ -34,6 +34,7 @@ from birdslam.lanes.ego_lane import EgoLane
 from birdslam.odometry.road.fit import RoadFit
 from birdslam.outputs.plain_words import DriveCounts, LengthsBy, verdict
 from birdslam.perception import Perception, Ready
+from birdslam.road_users.camera_height import BoxHeight
 from birdslam.runtime.calibration.given import KnownSize, known_length_of
 from birdslam.runtime.calibration.height import check_sigma_rel, lengths_by, with_height
 from birdslam.runtime.cli.main import main
@@ -42,7 +43,6 @@ from birdslam.sources.camera_file import camera_text, load_camera
 from birdslam.sources.recording import DatasetError
 from birdslam.sources.speed_file import read_speed_curve
 from birdslam.types import Frame, LaneLine, LineKind
-from birdslam.vehicles.camera_height import BoxHeight
 from tests.test_odometry import CAMERA, PITCH_RAD, render, street
 
 ROS = """image_width: 640

@@ -22,6 +22,12 @@ from birdslam.perception import Detections
 from birdslam.perception.decoding.detection import EdgeSigma
 from birdslam.perception.external import external_detections, undistort_boxes
 from birdslam.perception.families import FAMILIES, UNKNOWN
+from birdslam.road_users.placed_boxes import PlacedBox
+from birdslam.road_users.placement.localisation import LocalisationConfig
+from birdslam.road_users.state.ground_size_config import GroundSizeConfig
+from birdslam.road_users.state.ground_size_filter import GroundSizeFilter
+from birdslam.road_users.track import EgoFrame, TrackingConfig
+from birdslam.road_users.tracking import Tracker
 from birdslam.runtime.batch.offline import pipeline
 from birdslam.runtime.configuration import Configuration, ConfigurationError, load
 from birdslam.runtime.nodes.inference import source_detections
@@ -29,12 +35,6 @@ from birdslam.runtime.nodes.sources import open_source
 from birdslam.sources.detection_file import check_detections, read_detection_file
 from birdslam.sources.recording import DatasetError
 from birdslam.types import Estimate
-from birdslam.vehicles.placed_boxes import PlacedBox
-from birdslam.vehicles.placement.localisation import LocalisationConfig
-from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
-from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
-from birdslam.vehicles.track import EgoFrame, TrackingConfig
-from birdslam.vehicles.tracking import Tracker
 
 FRAMES = 7
 NAMES = ("person", "bicycle", "car", "motorcycle", "bus", "truck", "van", "trailer", "cyclist")

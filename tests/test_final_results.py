@@ -21,6 +21,7 @@ from birdslam.graph.weights import WeightsConfig
 from birdslam.outputs.drive_files import Recorder, ResultsError
 from birdslam.outputs.drive_video import DriveVideo, SideBySide, check_video
 from birdslam.outputs.final_trajectories import FinalTracks, last_seen
+from birdslam.road_users.rts_smoother import RtsSmoother, SmootherConfig
 from birdslam.runtime.cli.commands import parse
 from birdslam.runtime.cli.drives import replay
 from birdslam.runtime.cli.main import main
@@ -32,7 +33,6 @@ from birdslam.runtime.supervision.final_results import FinalResults, check_resul
 from birdslam.slam import SlamConfig
 from birdslam.trajectory import ego_pose, tum_row
 from birdslam.types import Attitude, Estimate, Measurements
-from birdslam.vehicles.rts_smoother import RtsSmoother, SmootherConfig
 from tests.taped_drive import CAMERA, Tape, measured
 
 

@@ -9,16 +9,16 @@ from msgspec.structs import replace
 
 from birdslam.geometry.camera import PLANE_AT_M, GroundPlane, VerticalCurvature
 from birdslam.geometry.se2 import SE2
-from birdslam.vehicles.placement.localisation import (
+from birdslam.road_users.placement.localisation import (
     LocalisationConfig,
     Observation,
     extent_m,
     observe_boxes,
 )
-from birdslam.vehicles.state.ground_measurements import COMMON
-from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
-from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter, estimate_curvature
-from birdslam.vehicles.state.parallax import LearnedSize
+from birdslam.road_users.state.ground_measurements import COMMON
+from birdslam.road_users.state.ground_size_config import GroundSizeConfig
+from birdslam.road_users.state.ground_size_filter import GroundSizeFilter, estimate_curvature
+from birdslam.road_users.state.parallax import LearnedSize
 from tests.boxes import CAR, cuboid_px, footprint_m
 from tests.recordings import KITTI as CAMERA
 

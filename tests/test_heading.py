@@ -10,8 +10,8 @@ import pytest
 from birdslam.bench.tracking.localisation import INSIDE_2_SIGMA
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
-from birdslam.vehicles.placement.localisation import LocalisationConfig, Observation, observe_boxes, place
-from birdslam.vehicles.placement.uncertain_yaw import HeadingConfig, YawPrior, initial_yaw_rad, marginalise_yaw
+from birdslam.road_users.placement.localisation import LocalisationConfig, Observation, observe_boxes, place
+from birdslam.road_users.placement.uncertain_yaw import HeadingConfig, YawPrior, initial_yaw_rad, marginalise_yaw
 from tests.boxes import CAR, cuboid_px, footprint_m
 from tests.recordings import KITTI as CAMERA
 

@@ -9,12 +9,12 @@ import pytest
 
 from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.se2 import SE2
-from birdslam.vehicles.placement.depth_fusion import PseudoLidarConfig
-from birdslam.vehicles.placement.localisation import LocalisationConfig, observe_boxes
-from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
-from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
-from birdslam.vehicles.track import EgoFrame, TrackingConfig
-from birdslam.vehicles.tracking import Tracker
+from birdslam.road_users.placement.depth_fusion import PseudoLidarConfig
+from birdslam.road_users.placement.localisation import LocalisationConfig, observe_boxes
+from birdslam.road_users.state.ground_size_config import GroundSizeConfig
+from birdslam.road_users.state.ground_size_filter import GroundSizeFilter
+from birdslam.road_users.track import EgoFrame, TrackingConfig
+from birdslam.road_users.tracking import Tracker
 from tests.boxes import CAR, car_px
 from tests.recordings import KITTI as CAMERA
 

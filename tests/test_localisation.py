@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.se2 import SE2
-from birdslam.vehicles.placement.localisation import (
+from birdslam.road_users.placement.localisation import (
     LocalisationConfig,
     Observation,
     Place,

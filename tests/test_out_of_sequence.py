@@ -16,13 +16,13 @@ from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.perception import Detections, Perception, Ready
 from birdslam.perception.decoding.detection import EdgeSigma
+from birdslam.road_users.out_of_sequence import OpenFrame, OutOfSequenceConfig, OutOfSequenceTracker
+from birdslam.road_users.placement.localisation import LocalisationConfig, iou
+from birdslam.road_users.state.ground_size_config import GroundSizeConfig
+from birdslam.road_users.state.ground_size_filter import GroundSizeFilter
+from birdslam.road_users.track import EgoFrame, TrackingConfig
+from birdslam.road_users.tracking import Tracker
 from birdslam.types import Measurements
-from birdslam.vehicles.out_of_sequence import OpenFrame, OutOfSequenceConfig, OutOfSequenceTracker
-from birdslam.vehicles.placement.localisation import LocalisationConfig, iou
-from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
-from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
-from birdslam.vehicles.track import EgoFrame, TrackingConfig
-from birdslam.vehicles.tracking import Tracker
 from tests.boxes import CAR, car_px
 from tests.test_frontend import CAMERA, ScriptedOdometry, frame, motion
 

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from birdslam.geometry.se2 import SE2
-from birdslam.vehicles.state.parallax import UNKNOWN_VARIANCE, LearnedSize, Parallax
-from birdslam.vehicles.state.parallax_config import ParallaxConfig
-from birdslam.vehicles.state.parallax_measurements import ParallaxMeasurements
+from birdslam.road_users.state.parallax import UNKNOWN_VARIANCE, LearnedSize, Parallax
+from birdslam.road_users.state.parallax_config import ParallaxConfig
+from birdslam.road_users.state.parallax_measurements import ParallaxMeasurements
 
 HEIGHT_M = 1.65  # of the camera
 REACH_M = 2.0

@@ -21,13 +21,19 @@ from birdslam.graph.around.hidden_road import hidden_fans
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
-from birdslam.people.people_boxes import PeopleBoxesConfig, observe_people
-from birdslam.people.people_config import PeopleConfig
-from birdslam.people.people_records import followed_people
-from birdslam.people.people_tracker import PeopleTracker, PeopleTrackingConfig
-from birdslam.people.road_tilt import SharedRoad
 from birdslam.perception import Detections
 from birdslam.queries import nearby
+from birdslam.road_users.out_of_sequence import OpenFrame
+from birdslam.road_users.people.people_boxes import PeopleBoxesConfig, observe_people
+from birdslam.road_users.people.people_config import PeopleConfig
+from birdslam.road_users.people.people_records import followed_people
+from birdslam.road_users.people.people_tracker import PeopleTracker, PeopleTrackingConfig
+from birdslam.road_users.people.road_tilt import SharedRoad
+from birdslam.road_users.placed_boxes import place_boxes
+from birdslam.road_users.placement.localisation import LocalisationConfig
+from birdslam.road_users.state.ground_size_config import GroundSizeConfig
+from birdslam.road_users.state.ground_size_filter import GroundSizeFilter
+from birdslam.road_users.track import EgoFrame, TrackingConfig
 from birdslam.types import (
     FIRST_PERSON,
     EgoEdge,
@@ -39,12 +45,6 @@ from birdslam.types import (
     RoadUser,
     Status,
 )
-from birdslam.vehicles.out_of_sequence import OpenFrame
-from birdslam.vehicles.placed_boxes import place_boxes
-from birdslam.vehicles.placement.localisation import LocalisationConfig
-from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
-from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
-from birdslam.vehicles.track import EgoFrame, TrackingConfig
 from tests.recordings import KITTI as CAMERA
 
 BOXES = PeopleBoxesConfig(), LocalisationConfig()

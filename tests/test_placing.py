@@ -9,13 +9,13 @@ import pytest
 from scipy.special import ndtr
 
 from birdslam.geometry.se2 import SE2
-from birdslam.vehicles.placement.depth_fusion import PseudoLidarConfig
-from birdslam.vehicles.placement.localisation import LocalisationConfig, Observation, observe_boxes
-from birdslam.vehicles.placement.uncertain_yaw import HeadingConfig
-from birdslam.vehicles.placing import Assignment, Placing, truncate_at_cut
-from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
-from birdslam.vehicles.state.ground_size_filter import Depths, GroundSizeFilter
-from birdslam.vehicles.state.parallax_config import ParallaxConfig
+from birdslam.road_users.placement.depth_fusion import PseudoLidarConfig
+from birdslam.road_users.placement.localisation import LocalisationConfig, Observation, observe_boxes
+from birdslam.road_users.placement.uncertain_yaw import HeadingConfig
+from birdslam.road_users.placing import Assignment, Placing, truncate_at_cut
+from birdslam.road_users.state.ground_size_config import GroundSizeConfig
+from birdslam.road_users.state.ground_size_filter import Depths, GroundSizeFilter
+from birdslam.road_users.state.parallax_config import ParallaxConfig
 from tests.boxes import CAR, cuboid_px, footprint_m
 from tests.test_frontend import CAMERA
 

@@ -15,10 +15,10 @@ from birdslam.geometry.bev import ego_to_pixel
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2, wrap
 from birdslam.perception import Boxes3d, DepthMap, Detections
-from birdslam.vehicles.placement.body_fit import fit_footprint, footprints, surface_m
-from birdslam.vehicles.placement.depth_fusion import DepthPlace, PseudoLidarConfig, fuse
-from birdslam.vehicles.placement.localisation import LocalisationConfig, Observation, Place, observe_boxes, place
-from birdslam.vehicles.placement.pseudolidar import in_metres, locate_detected_bodies, locate_in_depth_map
+from birdslam.road_users.placement.body_fit import fit_footprint, footprints, surface_m
+from birdslam.road_users.placement.depth_fusion import DepthPlace, PseudoLidarConfig, fuse
+from birdslam.road_users.placement.localisation import LocalisationConfig, Observation, Place, observe_boxes, place
+from birdslam.road_users.placement.pseudolidar import in_metres, locate_detected_bodies, locate_in_depth_map
 
 CAMERA = Camera(
     width_px=1242, height_px=375, fx_px=720.0, fy_px=720.0, cx_px=610.0, cy_px=173.0, height_m=1.65, pitch_rad=0.01

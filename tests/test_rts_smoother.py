@@ -17,8 +17,8 @@ from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.perception import Detections, Perception, Ready
+from birdslam.road_users.rts_smoother import RtsSmoother, SmootherConfig, VehicleMeasurement, smooth_vehicle
 from birdslam.types import Measurements, Status, VehicleEdge
-from birdslam.vehicles.rts_smoother import RtsSmoother, SmootherConfig, VehicleMeasurement, smooth_vehicle
 from tests.boxes import CAR, car_px
 from tests.cases import first
 from tests.test_frontend import CAMERA, ScriptedOdometry, frame, motion

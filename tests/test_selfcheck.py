@@ -25,11 +25,11 @@ from birdslam.odometry.odometry_config import OdometryConfig
 from birdslam.odometry.plausibility import PlausibilityConfig
 from birdslam.odometry.speed.zero_velocity import ZeroVelocityConfig
 from birdslam.perception import Perception, Ready, Segmentation
+from birdslam.road_users.camera_height import CameraHeightConfig, CameraHeightEstimator
+from birdslam.road_users.placement.localisation import LocalisationConfig
 from birdslam.sources.kitti_tracking import open_tracking, read_detections
 from birdslam.sources.opening import open_recording
 from birdslam.types import Estimate, Frame, Status, VehicleEdge
-from birdslam.vehicles.camera_height import CameraHeightConfig, CameraHeightEstimator
-from birdslam.vehicles.placement.localisation import LocalisationConfig
 from tests.cases import first
 
 Image = np.ndarray

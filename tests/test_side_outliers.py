@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
-from birdslam.vehicles.state.parallax import Parallax
-from birdslam.vehicles.state.parallax_config import ParallaxConfig
-from birdslam.vehicles.state.parallax_measurements import ParallaxMeasurements
-from birdslam.vehicles.state.side_outliers import update_with_side_outliers
+from birdslam.road_users.state.parallax import Parallax
+from birdslam.road_users.state.parallax_config import ParallaxConfig
+from birdslam.road_users.state.parallax_measurements import ParallaxMeasurements
+from birdslam.road_users.state.side_outliers import update_with_side_outliers
 
 N, FILTERS, STATES, CUES = 2, 3, 5, 4
 CAR_HEIGHT_M, CAR_WIDTH_M, CAMERA_M = 1.5, 1.6, 1.65

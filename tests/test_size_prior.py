@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from birdslam.geometry.camera import Camera, GroundPlane
-from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
-from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
-from birdslam.vehicles.state.size_prior import SizePrior
+from birdslam.road_users.state.ground_size_config import GroundSizeConfig
+from birdslam.road_users.state.ground_size_filter import GroundSizeFilter
+from birdslam.road_users.state.size_prior import SizePrior
 
 CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
 SIGMA, COMMON, DOF = 0.08, 0.025, 4.0

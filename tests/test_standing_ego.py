@@ -10,11 +10,11 @@ from birdslam.frontend import FrontEndConfig
 from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.perception import Detections
+from birdslam.road_users.placement.localisation import LocalisationConfig, extent_m, observe_boxes
+from birdslam.road_users.state.ground_size_config import GroundSizeConfig
+from birdslam.road_users.state.ground_size_filter import GroundSizeFilter
+from birdslam.road_users.state.parallax import LearnedSize
 from birdslam.sources.kitti_tracking import TrackingSequence
-from birdslam.vehicles.placement.localisation import LocalisationConfig, extent_m, observe_boxes
-from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
-from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
-from birdslam.vehicles.state.parallax import LearnedSize
 from tests.boxes import CAR, car_px
 from tests.recordings import KITTI as CAMERA
 

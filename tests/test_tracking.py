@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from birdslam.geometry.se2 import SE2, wrap
-from birdslam.vehicles.association import predict_boxes_px
-from birdslam.vehicles.placement.depth_fusion import DepthPlace
-from birdslam.vehicles.placement.localisation import LocalisationConfig, iou, observe_boxes
-from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
-from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
-from birdslam.vehicles.track import EgoFrame, Track, TrackingConfig
-from birdslam.vehicles.tracking import Tracker
+from birdslam.road_users.association import predict_boxes_px
+from birdslam.road_users.placement.depth_fusion import DepthPlace
+from birdslam.road_users.placement.localisation import LocalisationConfig, iou, observe_boxes
+from birdslam.road_users.state.ground_size_config import GroundSizeConfig
+from birdslam.road_users.state.ground_size_filter import GroundSizeFilter
+from birdslam.road_users.track import EgoFrame, Track, TrackingConfig
+from birdslam.road_users.tracking import Tracker
 from tests.boxes import cuboid_px, footprint_m
 from tests.recordings import KITTI as CAMERA
 

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from birdslam.geometry import bev
 from birdslam.geometry.se2 import SE2
 from birdslam.perception.manifest import LowerEdge
-from birdslam.vehicles.placement.depth_fusion import PseudoLidarConfig
-from birdslam.vehicles.placement.localisation import (
+from birdslam.road_users.placement.depth_fusion import PseudoLidarConfig
+from birdslam.road_users.placement.localisation import (
     DIMENSIONS,
     Dimensions,
     LocalisationConfig,
@@ -22,12 +22,12 @@ from birdslam.vehicles.placement.localisation import (
     corners_of,
     observe_boxes,
 )
-from birdslam.vehicles.placement.tyre_contact import bottom_at_face
-from birdslam.vehicles.placement.uncertain_yaw import HeadingConfig
-from birdslam.vehicles.placing import Assignment, Placing
-from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
-from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
-from birdslam.vehicles.state.parallax_config import ParallaxConfig
+from birdslam.road_users.placement.tyre_contact import bottom_at_face
+from birdslam.road_users.placement.uncertain_yaw import HeadingConfig
+from birdslam.road_users.placing import Assignment, Placing
+from birdslam.road_users.state.ground_size_config import GroundSizeConfig
+from birdslam.road_users.state.ground_size_filter import GroundSizeFilter
+from birdslam.road_users.state.parallax_config import ParallaxConfig
 from tests.test_frontend import CAMERA
 
 CONFIG = LocalisationConfig()

@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from birdslam.geometry.se2 import SE2
-from birdslam.vehicles.placement.localisation import LocalisationConfig, observe_boxes
-from birdslam.vehicles.placement.uncertain_yaw import HeadingConfig, evaluate_yaws
-from birdslam.vehicles.state.yaw_by_outline import YawByOutline
+from birdslam.road_users.placement.localisation import LocalisationConfig, observe_boxes
+from birdslam.road_users.placement.uncertain_yaw import HeadingConfig, evaluate_yaws
+from birdslam.road_users.state.yaw_by_outline import YawByOutline
 from tests.boxes import CAR, cuboid_px, footprint_m
 from tests.recordings import KITTI as CAMERA
 

@@ -2,7 +2,7 @@
 
 Least squares over four cues with covariances, widened by their disagreement (Birge's ratio): homography of the road
 (road/alignment.py), direction of travel, vanishing point of the road's lines (road/vanishing_point.py), and vehicles
-(vehicles/camera_height.py).
+(road_users/camera_height.py).
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from birdslam.odometry.motion import Motion
 from birdslam.odometry.odometry import Odometry
 from birdslam.odometry.road.fit import RoadFit
 from birdslam.odometry.road.vanishing_point import VanishingPoint
+from birdslam.road_users.camera_height import BoxHeight, measure_heights
 from birdslam.types import NS_PER_S, Frame, Status
-from birdslam.vehicles.camera_height import BoxHeight, measure_heights
 
 Floats = NDArray[np.float64]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]

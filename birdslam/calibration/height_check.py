@@ -1,7 +1,7 @@
 """Checks of the camera height by independent measurements.
 
 The camera height defines the metric scale, so images alone cannot check it. Known speeds or poses, sizes of vehicles
-(vehicles/camera_height.py) and widths of lanes (lane_width.py) each give a height with its sigma.
+(road_users/camera_height.py) and widths of lanes (lane_width.py) each give a height with its sigma.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
-from birdslam.vehicles.camera_height import (
+from birdslam.road_users.camera_height import (
     BANK_RAD,
     STATES,
     BoxHeight,

@@ -1,7 +1,7 @@
 """Decides whether vehicles are stationary or moving, and computes their reported velocity.
 
-Two probabilities of being stationary, that of the front end (vehicles/state/parallax.py) and the Savage-Dickey density
-ratio of the graph's velocity, are pooled by the mean of their log odds (Genest and Zidek 1986). The decision has
+Two probabilities of being stationary, that of the front end (road_users/state/parallax.py) and the Savage-Dickey
+density ratio of the velocity of the graph, are pooled by the mean log odds (Genest and Zidek 1986). The decision has
 hysteresis; the velocity has the covariance of a mixture. docs/method.md ("Stationary or moving") has the equations.
 """
 

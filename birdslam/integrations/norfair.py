@@ -11,7 +11,7 @@ from birdslam.geometry.camera import Camera
 from birdslam.perception.decoding.detection import Detections, EdgeSigma
 from birdslam.perception.external import external_detections
 from birdslam.perception.families import Family
-from birdslam.vehicles.placed_boxes import PlacedBox
+from birdslam.road_users.placed_boxes import PlacedBox
 
 KEY = "birdslam"  # in a detection's data
 

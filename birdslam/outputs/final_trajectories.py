@@ -1,6 +1,6 @@
 """Writes the final trajectories of a drive, which use later measurements as well.
 
-`tracks/ID.final.tum.txt` is one vehicle, smoothed (vehicles/rts_smoother.py). `ego.final.*` copies the live ego
+`tracks/ID.final.tum.txt` is one vehicle, smoothed (road_users/rts_smoother.py). `ego.final.*` copies the live ego
 poses: without loop closures, later measurements hardly change a pose outside the window of the graph.
 """
 
@@ -11,9 +11,9 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TextIO
 
+from birdslam.road_users.rts_smoother import RtsSmoother, SmootherConfig
 from birdslam.trajectory import ego_pose, tum_row
 from birdslam.types import Attitude, Estimate, MapUpdate, Measurements, VehicleEdge
-from birdslam.vehicles.rts_smoother import RtsSmoother, SmootherConfig
 
 EGO_FILES = {"ego.tum.txt": "ego.final.tum.txt", "ego.kitti.txt": "ego.final.kitti.txt"}
 TRACK_SUFFIX = ".final.tum.txt"

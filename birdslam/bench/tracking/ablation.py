@@ -20,8 +20,8 @@ from birdslam.bench.tracking.benchmark import PAPER, Final, Live
 from birdslam.geometry.camera import Camera
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.weights import NO_WEIGHT, EdgeType, WeightsConfig
+from birdslam.road_users.rts_smoother import SmootherConfig
 from birdslam.types import Measurements
-from birdslam.vehicles.rts_smoother import SmootherConfig
 
 CP_WEIGHTS = MappingProxyType({"cp_low": 0.01, "cp_medium": 1.0, "cp_high": 100.0})  # against CC's own
 DEPTHS_M = MappingProxyType(

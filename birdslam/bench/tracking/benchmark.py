@@ -28,12 +28,12 @@ from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.lanes.amodal.lane_mapper import LaneHead
 from birdslam.paper import PAPER as AS_PUBLISHED
+from birdslam.road_users.placement.pseudolidar import FrustumNetwork
+from birdslam.road_users.rts_smoother import RtsSmoother, SmootherConfig
 from birdslam.slam import SlamConfig
 from birdslam.sources.kitti import KITTI_RATE_HZ
 from birdslam.sources.kitti_tracking import VEHICLE_KINDS, TrackingSequence
 from birdslam.types import NS_PER_S, Frame, LandmarkEdge, LandmarkKind, Measurements
-from birdslam.vehicles.placement.pseudolidar import FrustumNetwork
-from birdslam.vehicles.rts_smoother import RtsSmoother, SmootherConfig
 
 EGO = "ego"
 MIN_FRAMES = 5  # a vehicle matched in fewer is left out of the report, unless the paper names it

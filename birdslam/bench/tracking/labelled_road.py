@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from birdslam.geometry.camera import GroundPlane
+from birdslam.road_users.state.ground_size_config import GroundSizeConfig
 from birdslam.sources.kitti_tracking import VEHICLE_KINDS, TrackingSequence
-from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
 
 HALF_SPAN = 3  # frames before and after, whose labels count too: a camera pitches within half a second
 MIN_DISTANCE_M, MAX_DISTANCE_M = 5.0, 60.0  # of labels that are used

@@ -15,10 +15,10 @@ import numpy as np
 from birdslam.bench.ego.trajectory_errors import rms
 from birdslam.geometry.arrays import Floats, Ints
 from birdslam.geometry.se2 import SE2
+from birdslam.road_users.placement.localisation import iou
 from birdslam.sources.kitti_tracking import VEHICLE_KINDS
 from birdslam.sources.label_projection import Label
 from birdslam.sources.recording import DatasetError
-from birdslam.vehicles.placement.localisation import iou
 
 MATCH_IOU = 0.5
 HOTA_IOU = np.arange(0.05, 0.99, 0.05)

@@ -1,6 +1,6 @@
 """The correlated part of a CV edge's error, which the vehicle's next edges do not average out.
 
-An edge is a filter's result (vehicles/state) that shares road, size and lower edge with the previous edge. A share of
+An edge is a filter's result (road_users/state) that shares road, size and lower edge with the previous edge. A share of
 its covariance C = F F' belongs to an error G n, G = sqrt(share) F, with two unit-variance numbers n, along and across
 the line of sight. They are considered, not estimated (Schmidt 1966); see docs/method.md, "Errors that last".
 """
@@ -13,7 +13,7 @@ import numpy as np
 
 from birdslam.geometry.arrays import Floats
 
-DRIVING_MPS = 1.0  # the view changes well above this speed (as in vehicles/state/ground_size_config.py)
+DRIVING_MPS = 1.0  # the view changes well above this speed (as in road_users/state/ground_size_config.py)
 _MIN_M2 = 1e-12
 
 

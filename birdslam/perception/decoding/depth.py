@@ -22,7 +22,7 @@ class DepthMap:
 
     The map covers the whole undistorted image of `image_width_px` x `image_height_px` at its own resolution. With
     `canonical_focal_rel` > 0 depths refer to a focal length of this factor times the image width; `in_metres` converts
-    them. Without `metric` the scale is unknown; the road gives it (birdslam/vehicles/placement/pseudolidar.py).
+    them. Without `metric` the scale is unknown; the road gives it (birdslam/road_users/placement/pseudolidar.py).
     """
 
     depth_m: Floats32

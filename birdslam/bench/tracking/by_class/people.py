@@ -20,10 +20,10 @@ from birdslam.bench.tracking.localisation import INSIDE_1_SIGMA, INSIDE_2_SIGMA
 from birdslam.bench.tracking.metrics import BoxFrame, assign
 from birdslam.geometry.arrays import Floats
 from birdslam.perception import Detections
+from birdslam.road_users.placement.localisation import iou
 from birdslam.sources.kitti_tracking import TrackingSequence
 from birdslam.sources.label_projection import Label, hull_px
 from birdslam.types import FollowedPerson, Measurements
-from birdslam.vehicles.placement.localisation import iou
 
 PEOPLE = ("pedestrian", "cyclist")
 RANGES_M = ((5.0, 15.0), (15.0, 30.0), (30.0, 50.0))

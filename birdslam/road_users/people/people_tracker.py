@@ -1,0 +1,246 @@
+"""Tracking of people: association, new tracks, deletion. Ids persist through a second of occlusion."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import msgspec
+import numpy as np
+
+from birdslam.geometry.arrays import Floats
+from birdslam.geometry.bev import RoadProfile
+from birdslam.geometry.camera import Camera
+from birdslam.perception import Detections
+from birdslam.road_users.out_of_sequence import OpenFrame
+from birdslam.road_users.people.box_model import MIN_SLOPE
+from birdslam.road_users.people.people_boxes import (
+    BICYCLE,
+    CYCLIST,
+    PEDESTRIAN,
+    PeopleBoxesConfig,
+    PersonBox,
+    observe_people,
+)
+from birdslam.road_users.people.people_config import PeopleConfig
+from birdslam.road_users.people.people_filter import PeopleFilter
+from birdslam.road_users.placement.localisation import LocalisationConfig, iou
+from birdslam.road_users.state.ground_size_filter import GroundSizeFilter
+from birdslam.road_users.track import TrackingConfig
+from birdslam.types import FIRST_PERSON
+
+IMPOSSIBLE_COST = 1e9
+NEW_PER_S = 1.0  # rate of new people, per unit of bearing, slope and log height
+MIN_DT_S = 1e-3
+SIDE_MARGIN = 0.03  # of the image width, beyond which a person has left
+MAX_OUTSIDE_S = 0.3  # until a person outside the image is removed
+
+SHAPE_DOF = 3.0  # of Student's t
+
+MIN_STATIONARY_PROBABILITY, MIN_STAY_PROBABILITY = 0.7, 0.4  # hysteresis of standing
+
+
+class PeopleTrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Parameters of association and of tracks."""
+
+    gate: float = 16.3  # squared Mahalanobis distance of bearing, bottom and top: 99.9 % of three
+    birth_iou: float = 0.55  # maximum overlap with a tracked box to start a track
+    forget_s: float = 1.5  # without a box, with an id
+    seen_for_s: float = 1.1  # mean time until a person has no box
+    hidden_for_s: float = 0.65  # mean time until the box returns
+    sigma_shape: float = 0.07  # of the log aspect of a box, between two boxes
+    sigma_stride: float = 0.14  # and due to swinging limbs
+    stride_s: float = 1.0  # time constant of that
+    sigma_shapes: float = 0.17  # of the log aspect among people
+    most: int = 60  # maximum number of tracks: the nearest
+    boxes: PeopleBoxesConfig = PeopleBoxesConfig()
+    people: PeopleConfig = PeopleConfig()
+
+
+@dataclass
+class PersonTrack:
+    """A tracked person, in the row of the filter with its index."""
+
+    box: PersonBox  # last one
+    seen_ns: int
+    seen_frame: int
+    person: int = -1  # persistent id, once confirmed
+    hits: int = 1
+    votes: Counter[str] = field(default_factory=Counter)
+    is_stationary: bool = False  # with hysteresis
+    outside_s: float = 0.0  # time outside the image, as predicted
+
+    @property
+    def label(self) -> str:
+        """The class; a bicycle with an occasionally detected rider is a cyclist."""
+        return CYCLIST if self.votes[CYCLIST] * 2 >= self.votes[PEDESTRIAN] and self.votes[CYCLIST] else PEDESTRIAN
+
+    @property
+    def label_probability(self) -> float:
+        """Probability of the class by the rule of succession."""
+        of = self.votes[self.label]
+        return (of + 1.0) / (self.votes[PEDESTRIAN] + self.votes[CYCLIST] + 2.0)
+
+
+class PeopleTracker:
+    """Calls: settle() for each frame in order, with its detections or without.
+
+    The road is the front end's ground in that frame, with its vertical curvature.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        config: PeopleTrackingConfig,
+        tracking: TrackingConfig,
+        localisation: LocalisationConfig,
+        first_id: int = FIRST_PERSON,
+    ) -> None:
+        """`tracking` and `localisation` are those of vehicles, for what both have in common."""
+        from scipy.optimize import linear_sum_assignment  # lazy: 9 MB that only the tracking process needs
+
+        self._assign = linear_sum_assignment
+        self.camera = camera
+        self.config = config
+        self.tracking = tracking
+        self.localisation = localisation
+        self.filter = PeopleFilter(config.people)
+        self.tracks: list[PersonTrack] = []
+        self.frame: OpenFrame | None = None  # last settled frame
+        self._pitch_rad: float | None = None
+        self.next_id = first_id
+
+    def settle(self, frame: OpenFrame, detections: Detections | None, road: GroundSizeFilter) -> None:
+        """Processes the next frame; `detections` is None if no detector processed it, `road` is the ground in it."""
+        ego, ground = frame.ego, road.ground
+        profile = RoadProfile(ground.height_m, road.vertical_per_m)
+        self._predict(frame, road)
+        self.frame = frame
+        if detections is not None:
+            boxes = observe_people(detections, self.camera, ground, self.config.boxes, self.localisation)
+            pairs = self._associate(boxes, frame, profile)
+            rows = [row for row, _ in pairs]
+            self.filter.correct(rows, [boxes[k] for _, k in pairs], ego.T_world_ego, profile)
+            for row, k in pairs:
+                track = self.tracks[row]
+                track.box, track.seen_ns, track.seen_frame = boxes[k], ego.t_source_ns, ego.frame_id
+                track.hits += 1
+                track.votes[boxes[k].label] += 1
+            self.filter.update_shared_priors()
+            self._start_tracks(boxes, {k for _, k in pairs}, frame, profile)
+        self._finish_frame(frame)
+
+    def _predict(self, frame: OpenFrame, road: GroundSizeFilter) -> None:
+        ego, pitch_rad = frame.ego, road.ground.pitch_rad
+        shift_rad = 0.0 if self._pitch_rad is None else pitch_rad - self._pitch_rad - (frame.turn_rad or 0.0)
+        self._pitch_rad = pitch_rad
+        driving = road.driving_share(frame.dt_s, frame.travelled_m)
+        keep_tilt = math.exp(-driving * frame.dt_s / road.config.tilt_memory_s)
+        self.filter.predict(
+            frame.dt_s, ego.T_world_ego, ego.step_cov, shift_rad, driving, keep_tilt, road.sigma_pitch_rad
+        )
+
+    def _associate(self, boxes: Sequence[PersonBox], frame: OpenFrame, road: RoadProfile) -> list[tuple[int, int]]:
+        """Pairs (row, box) of least total cost, -2 log likelihood within the gate."""
+        if not boxes or not self.tracks:
+            return []
+        squared, costs = self.filter.distances(boxes, frame.ego.T_world_ego, road)
+        costs += self._shape_costs(boxes, frame.ego.t_source_ns)
+        squared, costs = np.where(costs[0] <= costs[1], squared[0], squared[1]), costs.min(axis=0)
+        t_ns = frame.ego.t_source_ns
+        since_s = max((t_ns - max(track.seen_ns for track in self.tracks)) * 1e-9, MIN_DT_S)  # anybody had a box
+        costs += self._detection_costs(since_s) + self._class_costs(boxes)
+        cost = np.where(squared <= self.config.gate, costs, IMPOSSIBLE_COST)
+        new = -2.0 * math.log(NEW_PER_S * since_s)
+        births = np.where(np.eye(len(boxes)), new, IMPOSSIBLE_COST)  # one row per box, for a new person
+        rows, columns = self._assign(np.vstack([cost, births]))
+        known = len(self.tracks)
+        return [
+            (int(i), int(j)) for i, j in zip(rows, columns, strict=True) if i < known and cost[i, j] < IMPOSSIBLE_COST
+        ]  # fmt: skip
+
+    def _detection_costs(self, since_s: float) -> Floats:
+        """(N, 1) -2 log odds that each person has a box, by a Markov chain.
+
+        So an occluded person does not take the box of the person in front.
+        """
+        lost = -math.expm1(-since_s / self.config.seen_for_s)
+        found = -math.expm1(-since_s / self.config.hidden_for_s)
+        last = max(track.seen_frame for track in self.tracks)
+        again = np.where([track.seen_frame == last for track in self.tracks], 1.0 - lost, found)
+        return np.asarray(-2.0 * np.log(again / (1.0 - again)))[:, None]
+
+    def _class_costs(self, boxes: Sequence[PersonBox]) -> Floats:
+        """(N, M) -2 log probability of each box's class by the votes of each track (rule of succession)."""
+        rides = np.array([box.label != PEDESTRIAN for box in boxes])
+        walked = np.array([track.votes[PEDESTRIAN] for track in self.tracks])[:, None]
+        all_votes = np.array([track.votes.total() for track in self.tracks])[:, None]
+        return np.asarray(-2.0 * np.log((np.where(rides, all_votes - walked, walked) + 1.0) / (all_votes + 2.0)))
+
+    def _shape_costs(self, boxes: Sequence[PersonBox], t_ns: int) -> Floats:
+        """(2, N, M) -2 log likelihood ratio of the shape of each box, given the last box of each track.
+
+        With visible feet (first) the aspect stays, with hidden feet (second) the width, while the height shrinks.
+        Student's t, since limbs swing and are occluded.
+        """
+        config, before = self.config, [track.box for track in self.tracks]
+        (last_width, last), (now_width, now) = (
+            (
+                np.array([box.log_width for box in of]),
+                np.array([box.log_width - math.log(max(box.tan_height, MIN_SLOPE)) for box in of]),
+            )
+            for of in (before, boxes)
+        )
+        unseen_s = np.array([(t_ns - track.seen_ns) * 1e-9 for track in self.tracks])[:, None]
+        variance = config.sigma_shape**2 - config.sigma_stride**2 * np.expm1(-unseen_s / config.stride_s)
+        off = np.stack([np.subtract.outer(last, now), np.subtract.outer(last_width, now_width)])
+        squared = np.square(off) / variance
+        cost = (SHAPE_DOF + 1.0) * np.log1p(squared / SHAPE_DOF) + np.log(variance / config.sigma_shapes**2)
+        same = np.equal.outer([box.label for box in before], [box.label for box in boxes])
+        return np.where(same, cost, 0.0)
+
+    def _start_tracks(self, boxes: list[PersonBox], matched: set[int], frame: OpenFrame, road: RoadProfile) -> None:
+        followed = np.array([boxes[k].box_px for k in matched]).reshape(-1, 4)
+        births: list[int] = []
+        for k, box in enumerate(boxes):
+            if k in matched or box.label == BICYCLE or box.score < self.tracking.birth_score:
+                continue
+            if len(followed) and iou(np.array([box.box_px]), followed).max() > self.config.birth_iou:
+                continue
+            births.append(k)
+        ego = frame.ego
+        self.filter.add_people([boxes[k] for k in births], ego.T_world_ego, road)
+        self.tracks += [
+            PersonTrack(boxes[k], ego.t_source_ns, ego.frame_id, votes=Counter({boxes[k].label: 1})) for k in births
+        ]  # fmt: skip
+
+    def _finish_frame(self, frame: OpenFrame) -> None:
+        """Removes lost tracks, assigns ids, decides which people are standing."""
+        if not self.tracks:
+            return
+        ego, moments = frame.ego, self.filter.moments()
+        at = (moments.mean[:, :2] - [ego.T_world_ego.x_m, ego.T_world_ego.y_m]) @ ego.T_world_ego.rotation()
+        edge = (0.5 + SIDE_MARGIN) * self.camera.width_px / self.camera.fx_px
+        alive = []
+        for row, track in enumerate(self.tracks):
+            x_m, y_m = at[row].tolist()
+            outside = x_m < 1.0 or abs(y_m) > edge * x_m
+            track.outside_s = track.outside_s + frame.dt_s if outside and track.seen_ns != ego.t_source_ns else 0.0
+            lasting = track.hits >= self.tracking.confirm_hits
+            unseen_s = (ego.t_source_ns - track.seen_ns) * 1e-9
+            limit_s = self.config.forget_s if lasting else self.tracking.forget_unconfirmed_s
+            if unseen_s <= limit_s and track.outside_s <= MAX_OUTSIDE_S and math.isfinite(x_m + y_m):
+                alive.append((math.hypot(x_m, y_m), row))
+        rows = sorted(row for _, row in sorted(alive)[: self.config.most])
+        if len(rows) < len(self.tracks):
+            gone = set(range(len(self.tracks))) - set(rows)
+            self.filter.keep_rows(rows, [row for row in sorted(gone) if self.tracks[row].person >= 0])
+            self.tracks = [self.tracks[row] for row in rows]
+        for track, standing in zip(self.tracks, moments.standing[rows].tolist(), strict=True):
+            if track.person < 0 and track.hits >= self.tracking.confirm_hits:
+                track.person, self.next_id = self.next_id, self.next_id + 1
+            track.is_stationary = standing > (
+                MIN_STAY_PROBABILITY if track.is_stationary else MIN_STATIONARY_PROBABILITY
+            )

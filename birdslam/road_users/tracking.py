@@ -1,0 +1,343 @@
+"""Dynamic object localisation (paper, Fig. 2): tracking of vehicles in bird's-eye view.
+
+`Tracker.localise_vehicles` places the boxes of a frame by the pseudo-lidar and by Eq. 1 and fuses both. The places
+update tracks with persistent ids, from which vehicle_edges.py makes the CV and VV edges.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.se2 import SE2, wrap
+from birdslam.perception import DepthMap, Detections
+from birdslam.road_users.association import assign_track_ids, at_border, match_track_ids, predict_boxes_px, within_gate
+from birdslam.road_users.placement.depth_fusion import DepthPlace, PseudoLidarConfig
+from birdslam.road_users.placement.localisation import (
+    MIN_DISTANCE_M,
+    LocalisationConfig,
+    Observation,
+    Place,
+    extent_m,
+    iou,
+    observe_boxes,
+)
+from birdslam.road_users.placement.pseudolidar import FrustumNetwork, locate_by_depth
+from birdslam.road_users.placing import Assignment, Placing
+from birdslam.road_users.state.ground_size_filter import GroundSizeFilter
+from birdslam.road_users.state.yaw_filter import YawFilter
+from birdslam.road_users.track import EgoFrame, Track, TrackingConfig, VehicleFilter, in_vehicle_axes
+from birdslam.types import MotionEdge
+
+Floats = NDArray[np.float64]
+
+MAX_MOTION_SIGMAS = 2.0  # of the motion since the last observation, for association
+
+
+class Tracker:
+    """A constant-velocity Kalman filter for each vehicle.
+
+    State: x, y (m) and vx, vy (m/s) of the centre in the odometry world (dead reckoning since the start). Measurement:
+    the centre (m) in ego from `placing.Placing`, with its covariance. Readers: association and placing in the next
+    frame, `yaw_filter.YawFilter`, and `vehicle_edges`. Planners read the pose graph instead.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        config: TrackingConfig,
+        localisation: LocalisationConfig,
+        ground_size: GroundSizeFilter,
+        pseudolidar: PseudoLidarConfig | None = None,
+        frustum_network: FrustumNetwork | None = None,
+        first_id: int = 0,
+    ) -> None:
+        from scipy.optimize import linear_sum_assignment  # lazy: 9 MB that only the tracking process needs
+
+        self._assign = linear_sum_assignment
+        self.camera = camera
+        self.config = config
+        self.localisation = localisation
+        self.pseudolidar = pseudolidar or PseudoLidarConfig()
+        self.frustum_network = frustum_network
+        self.ground_size = ground_size
+        self.placing = Placing(ground_size, localisation, config.parallax, self.pseudolidar, config.heading)
+        self.yaw = YawFilter(config, localisation, ground_size)
+        self.tracks: list[Track] = []
+        self._filters: tuple[VehicleFilter, ...] = (  # with one row per track
+            self.placing.parallax,
+            ground_size,
+            self.placing.yaw_by_outline,
+        )
+        self.next_id = first_id
+        self._last: EgoFrame | None = None
+
+    def localise_vehicles(
+        self,
+        frame: EgoFrame,
+        detections: Detections | None,
+        depth: DepthMap | None = None,
+        road: NDArray[np.bool_] | None = None,
+    ) -> list[Track]:
+        """Returns the confirmed tracks with detections in this frame, ordered by id.
+
+        The ground and size filter must be at this frame. `depth` and the mask `road` (H, W) are of this frame, or None.
+        Without detections, tracks are predicted only.
+        """
+        if detections is None:
+            return self.update(frame, None)
+        observations = observe_boxes(
+            detections.boxes_px,
+            detections.scores,
+            detections.labels,
+            self.camera,
+            self.ground_size.ground,
+            self.localisation,
+            detections.edge_sigma,
+            detections.lower_edge,
+        )
+        if detections.track_ids is not None:
+            observations = assign_track_ids(observations, detections.track_ids)
+        observations, by_depth = locate_by_depth(
+            observations,
+            detections,
+            depth,
+            self.camera,
+            self.ground_size.ground,
+            self.pseudolidar,
+            road,
+            self.frustum_network,
+        )
+        return self.update(frame, observations, by_depth)
+
+    def update(
+        self,
+        frame: EgoFrame,
+        observations: list[Observation] | None,
+        by_depth: Sequence[DepthPlace | None] = (),
+    ) -> list[Track]:
+        """Predicts, associates, places, corrects, creates and deletes tracks; returns the confirmed observed ones.
+
+        `by_depth` has the place by depth of each observation, or is empty. `observations` is None if no detector
+        processed this frame.
+        """
+        self._predict(frame)
+        for known in self.tracks:
+            known.missed += observations is not None
+        assignments = self._assignments(frame, observations or [], by_depth)
+        self._reclassify(assignments, frame.T_world_ego)
+        places = self.placing.locate(assignments, frame.T_world_ego)
+        self._correct(assignments, places, frame)
+        for assignment, where in zip(assignments, places, strict=True):
+            if assignment.track is None:
+                self.tracks.append(self._start_track(assignment, where, frame))
+                self.yaw.correct_by_outline(assignment.row, self.tracks[-1], self.placing.yaw_by_outline)
+        self._delete_lost(frame)
+        return self._confirmed(frame)
+
+    def _predict(self, frame: EgoFrame) -> None:
+        last = frame if self._last is None else self._last
+        dt_s = max(0.0, (frame.t_source_ns - last.t_source_ns) * 1e-9)
+        self.yaw.predict(dt_s, last.T_world_ego.between(frame.T_world_ego))
+        self.placing.predict(dt_s, frame.T_world_ego, frame.step_cov)
+        F = np.eye(4)
+        F[0, 2] = F[1, 3] = dt_s
+        G = np.array([[dt_s**2 / 2, 0.0], [0.0, dt_s**2 / 2], [dt_s, 0.0], [0.0, dt_s]])
+        Q = G @ G.T * self.config.sigma_accel_mps2**2
+        if self.tracks:
+            states = np.array([track.state for track in self.tracks]) @ F.T
+            covs = F @ np.array([track.cov for track in self.tracks]) @ F.T + Q
+            for track, state, cov in zip(self.tracks, states, covs, strict=True):
+                track.state, track.cov = state, cov
+        self._last = frame
+
+    def _assignments(
+        self, frame: EgoFrame, observations: list[Observation], by_depth: Sequence[DepthPlace | None]
+    ) -> list[Assignment]:
+        """Assignments of observations to known tracks, then those of new tracks, each with its place by depth."""
+        known = self._associate(frame.T_world_ego, observations)
+        matched = {k for _, k in known}
+        births = [k for k, o in enumerate(observations) if k not in matched and o.score >= self.config.birth_score]
+        tracks: list[Track | None] = [*self.tracks, *(None for _ in births)]
+        pairs = [*known, *enumerate(births, len(self.tracks))]
+        return [
+            Assignment(
+                row,
+                tracks[row],
+                self._with_voted_class(tracks[row], observations[k]),
+                by_depth[k] if by_depth else None,
+            )
+            for row, k in pairs
+        ]
+
+    def _with_voted_class(self, track: Track | None, seen: Observation) -> Observation:
+        """The observation with the dimensions of its track's most frequent class."""
+        label = seen.label if track is None else track.label_with(seen.label)
+        if label == seen.label:
+            return seen
+        return msgspec.structs.replace(seen, dimensions=self.localisation.vehicles[label])
+
+    def _reclassify(self, assignments: Sequence[Assignment], T_world_ego: SE2) -> None:
+        """Changes the class of tracks whose most frequent label changes with these boxes."""
+        for a in assignments:
+            if a.track is not None and (label := a.track.label_with(a.observation.label)) != a.track.label:
+                of_class, yaw_rad = self.localisation.vehicles, a.yaw_rad(T_world_ego, self.config.heading)
+                depth_m, bearing = a.expected_depth_m(T_world_ego), a.observation.bearing
+                now, before = (extent_m(of_class[k], yaw_rad, depth_m, bearing)[1] for k in (label, a.track.label))
+                self.ground_size.reclassify(a.row, of_class[label], math.log(now / before))
+
+    def _associate(self, T_world_ego: SE2, observations: list[Observation]) -> list[tuple[int, int]]:
+        """Pairs (row of a track, its observation) with the largest total overlap within the gates."""
+        if not self.tracks or not observations:
+            return []
+        if observations[0].track_id is not None:
+            return match_track_ids(self.tracks, observations)
+        predicted = predict_boxes_px(self.tracks, self.camera, T_world_ego, self.ground_size.ground)
+        overlap = np.nan_to_num(iou(predicted, np.array([o.box_px for o in observations])), nan=0.0)
+        more = overlap - self._min_overlaps(predicted)[:, None]
+        possible = (more >= 0.0) & within_gate(self.tracks, observations, T_world_ego, self.config.gate_sigma)
+        # A missing box costs as much as one at the bound, so that no box is shifted to another track
+        rows, columns = self._assign(np.where(possible, -more, 0.0))
+        return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if possible[i, j]]
+
+    def _min_overlaps(self, predicted_px: Floats) -> Floats:
+        """(N,) minimum overlap of an observation with each predicted box (N, 4).
+
+        After an interval without observations it decreases to the overlap of boxes that are MAX_MOTION_SIGMAS apart.
+        """
+        assert self._last is not None
+        t_ns, T_world_ego = self._last.t_source_ns, self._last.T_world_ego
+        unseen_s = np.array([(t_ns - track.frame.t_source_ns) * 1e-9 for track in self.tracks])
+        R = T_world_ego.rotation()
+        ahead, aside = np.einsum("ji,njk,ki->in", R, np.array([track.cov[2:, 2:] for track in self.tracks]), R)
+        sight = (np.array([track.state[:2] for track in self.tracks]) - [T_world_ego.x_m, T_world_ego.y_m]) @ R
+        depth_m = np.maximum(sight[:, 0], MIN_DISTANCE_M)
+        nearer = MAX_MOTION_SIGMAS * np.sqrt(ahead) * unseen_s / depth_m  # relative
+        shift_px = MAX_MOTION_SIGMAS * np.sqrt(aside) * unseen_s / depth_m * self.camera.fx_px
+        shift = np.minimum(shift_px / np.maximum(predicted_px[:, 2] - predicted_px[:, 0], 1.0), 1.0)
+        left = (1.0 - shift) / (1.0 + shift) / np.square(1.0 + nearer)
+        just_seen = np.where(unseen_s <= self.config.just_seen_s, 1.0, left)
+        least = np.maximum(self.config.min_iou, self.config.min_iou_just_seen * just_seen)
+        return np.where(at_border(predicted_px, self.camera), self.config.min_iou, least)
+
+    def _correct(self, assignments: Sequence[Assignment], places: Sequence[Place], frame: EgoFrame) -> None:
+        """Updates the known tracks by the places of their observations, all at once."""
+        known = [(a.track, a, place) for a, place in zip(assignments, places, strict=True) if a.track is not None]
+        if not known:
+            return
+        state = np.array([track.state for track, *_ in known])
+        cov = np.array([track.cov for track, *_ in known])
+        R = frame.T_world_ego.rotation()
+        R_seen = R @ np.array([seen.cov for *_, seen in known]) @ R.T
+        S = cov[:, :2, :2] + R_seen
+        innovation = frame.T_world_ego @ np.array([seen.centre_m for *_, seen in known]) - state[:, :2]
+        information = np.linalg.inv(S)
+        nis = np.einsum("na,nab,nb->n", innovation, information, innovation).tolist()
+        gain = cov[:, :, :2] @ information
+        corrected = state + (gain @ innovation[..., None])[..., 0]
+        corrected_cov = cov - gain @ S @ gain.swapaxes(1, 2)
+        is_stationary = np.array(
+            [
+                self.placing.parallax.stationary_probability(a.row) > self.config.standing_probability
+                for _, a, _ in known
+            ]
+        )
+        self._zero_velocity_update(corrected, corrected_cov, is_stationary)
+        for k, (track, assignment, seen) in enumerate(known):
+            track.motion = self._predicted_motion(track, frame)
+            track.is_stationary = bool(is_stationary[k])
+            if track.is_stationary and nis[k] > self.config.gate_sigma**2:
+                # The size was re-estimated, which moves the place without a motion
+                track.state[:2] += innovation[k]
+                track.first_m = track.first_m + innovation[k]
+                track.cov[:2, :], track.cov[2:, :2] = 0.0, 0.0
+                track.cov[:2, :2] = R_seen[k]
+            else:
+                track.state, track.cov = corrected[k], corrected_cov[k]
+            track.observation, track.place, track.frame = assignment.observation, seen, frame
+            track.hits += 1
+            track.missed = 0
+            track.votes[assignment.observation.label] += 1
+            self.yaw.correct_by_motion(assignment.row, track)
+            self.yaw.correct_by_body(assignment.row, track, assignment.by_depth)
+            self.yaw.correct_by_outline(assignment.row, track, self.placing.yaw_by_outline)
+
+    def _zero_velocity_update(self, states: Floats, covs: Floats, which: NDArray[np.bool_]) -> None:
+        """Zero-velocity update of `which` of the states (N, 4), in place."""
+        velocity_cov = covs[which, 2:, 2:] + np.eye(2) * self.config.sigma_standing_mps**2
+        gain = covs[which, :, 2:] @ np.linalg.inv(velocity_cov)
+        states[which] -= (gain @ states[which, 2:, None])[..., 0]
+        covs[which] -= gain @ covs[which, 2:]
+
+    def _predicted_motion(self, track: Track, frame: EgoFrame) -> MotionEdge | None:
+        """VV edge by constant velocity; None for a track without a CV edge."""
+        if track.last_edge is None:
+            return None
+        dt_s = (frame.t_source_ns - track.last_edge.t_ns) * 1e-9
+        xx, xy, yy = in_vehicle_axes(track.cov[2:, 2:], track.yaw_rad)
+        by_acceleration = (self.config.sigma_accel_mps2 * dt_s**2 / 2.0) ** 2
+        xx, xy, yy = xx * dt_s**2 + by_acceleration, xy * dt_s**2, yy * dt_s**2 + by_acceleration
+        return MotionEdge(
+            vehicle=track.vehicle,
+            from_frame=track.last_edge.frame,
+            to_frame=frame.frame_id,
+            T_from_to=track.last_edge.T_world_vehicle.between(track.pose()),
+            cov=(xx, xy, 0.0, xy, yy, 0.0, 0.0, 0.0, (self.config.sigma_yaw_rate_radps * dt_s) ** 2),
+        )
+
+    def _start_track(self, assignment: Assignment, seen: Place, frame: EgoFrame) -> Track:
+        observation, by_depth = assignment.observation, assignment.by_depth
+        if by_depth is not None and not by_depth.has_front:
+            by_depth = None
+        T_world_ego = frame.T_world_ego
+        R = T_world_ego.rotation()
+        cov = np.zeros((4, 4))
+        cov[:2, :2] = R @ seen.cov @ R.T
+        cov[2:, 2:] = np.eye(2) * self.config.sigma_birth_mps**2
+        return Track(
+            state=np.concatenate([T_world_ego @ seen.centre_m, np.zeros(2)]),
+            cov=cov,
+            yaw_rad=wrap(T_world_ego.yaw_rad + assignment.yaw_rad(T_world_ego, self.config.heading)),
+            observation=observation,
+            place=seen,
+            first_m=T_world_ego @ seen.centre_m,
+            first_offset_m=R @ seen.centre_m,
+            frame=frame,
+            votes=Counter({observation.label: 1}),
+            sigma_yaw_rad=0.0 if by_depth is None else by_depth.sigma_yaw_rad,
+            is_yaw_known=by_depth is not None,
+            front_logit=0.0 if by_depth is None else by_depth.front_logit,
+        )
+
+    def _delete_lost(self, frame: EgoFrame) -> None:
+        """Deletes tracks without recent observations, and their rows in all filters."""
+        rows = [row for row, track in enumerate(self.tracks) if not self._is_lost(track, frame.t_source_ns)]
+        if len(rows) < len(self.tracks):
+            self.tracks = [self.tracks[row] for row in rows]
+            for states in self._filters:
+                states.keep_rows(rows)
+
+    def _is_lost(self, track: Track, t_source_ns: int) -> bool:
+        lasting = track.hits >= self.config.confirm_hits or not track.missed
+        patience_s = self.config.forget_s if lasting else self.config.forget_unconfirmed_s
+        return (t_source_ns - track.frame.t_source_ns) * 1e-9 > patience_s
+
+    def _confirmed(self, frame: EgoFrame) -> list[Track]:
+        """The confirmed tracks observed in this frame; a newly confirmed one gets its id."""
+        seen_now = [
+            track
+            for track in self.tracks
+            if track.frame.frame_id == frame.frame_id and track.hits >= self.config.confirm_hits
+        ]
+        for track in seen_now:
+            if track.vehicle < 0 and track.observation.track_id is not None:
+                track.vehicle = track.observation.track_id
+            elif track.vehicle < 0:
+                track.vehicle, self.next_id = self.next_id, self.next_id + 1
+        return sorted(seen_now, key=lambda track: track.vehicle)
