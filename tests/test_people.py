@@ -24,11 +24,11 @@ from birdslam.graph.weights import WeightsConfig
 from birdslam.perception import Detections
 from birdslam.queries import nearby
 from birdslam.road_users.out_of_sequence import OpenFrame
+from birdslam.road_users.people.box_model import road_tilts
 from birdslam.road_users.people.people_boxes import PeopleBoxesConfig, observe_people
 from birdslam.road_users.people.people_config import PeopleConfig
 from birdslam.road_users.people.people_records import followed_people
 from birdslam.road_users.people.people_tracker import PeopleTracker, PeopleTrackingConfig
-from birdslam.road_users.people.road_tilt import SharedRoad
 from birdslam.road_users.placed_boxes import place_boxes
 from birdslam.road_users.placement.localisation import LocalisationConfig
 from birdslam.road_users.state.ground_size_config import GroundSizeConfig
@@ -48,7 +48,6 @@ from birdslam.types import (
 from tests.recordings import KITTI as CAMERA
 
 BOXES = PeopleBoxesConfig(), LocalisationConfig()
-ROAD = GroundSizeFilter(CAMERA, GroundSizeConfig())
 Box = tuple[float, float, float, float]
 HZ = 10.0
 
@@ -79,18 +78,21 @@ class Scene:
 
     def __init__(self, ego_mps: float = 0.0) -> None:
         self.tracker = PeopleTracker(CAMERA, PeopleTrackingConfig(), TrackingConfig(), LocalisationConfig())
+        self.road = GroundSizeFilter(CAMERA, GroundSizeConfig())
         self.ego_mps, self.k = ego_mps, 0
 
     @property
     def ego_m(self) -> float:
         return self.ego_mps * self.k / HZ
 
-    def see(self, detections: Detections | None, road: GroundSizeFilter = ROAD) -> tuple[FollowedPerson, ...]:
+    def see(self, detections: Detections | None, road: GroundSizeFilter | None = None) -> tuple[FollowedPerson, ...]:
         """The next frame."""
         ego = EgoFrame(self.k, round(self.k * 1e9 / HZ), SE2(self.ego_m, 0.0, 0.0), np.zeros((3, 3)))
         dt_s = 0.0 if self.k == 0 else 1.0 / HZ
         frame = OpenFrame(ego, dt_s, 0.0, None, None, self.ego_mps * dt_s)
-        self.tracker.settle(frame, detections, road)
+        if road is None:
+            self.road.predict(dt_s, 0.0, None, None, self.ego_mps * dt_s)
+        self.tracker.settle(frame, detections, self.road if road is None else road)
         self.k += 1
         return followed_people(self.tracker, ego)
 
@@ -182,22 +184,19 @@ def test_tilt_from_later_people_corrects_earlier_ones() -> None:
 
 
 def test_near_people_give_heights_and_far_people_the_tilt() -> None:
-    config = PeopleConfig()
-    road, camera_m = SharedRoad(config), CAMERA.height_m
+    road = GroundSizeFilter(CAMERA, GroundSizeConfig())
+    road.predict(1.0, 0.0, None, None)
     places = [(x_m, y_m) for x_m in (6.5, 8.0, 11.0, 18.0, 28.0, 35.0) for y_m in (-2.0, 2.0)]
     boxes = [box_of(*place, 1.72 * math.exp(0.08), rise=0.02) for place in places]
     seen = observe_people(found(boxes), CAMERA, CAMERA.ground, *BOXES)
-    road.predict(1.0, 0.0, 0.02)
-    road.add_people(len(seen))
-    before = road.leave_one_out()
-    road.add_boxes(range(1), seen[:1], RoadProfile(camera_m))
-    np.testing.assert_array_equal(road.leave_one_out()[0], before[0])
-    road.add_boxes(range(1, len(seen)), seen[1:], RoadProfile(camera_m))
-    (tilt, tilt_var), (log_height, height_var) = road.leave_one_out()[-1].tolist()
-    assert abs(tilt - 0.02) < 2.0 * math.sqrt(tilt_var) < 0.02
+    before, sigma_before = road.ground.pitch_rad, road.sigma_pitch_rad
+    road.correct_by_people(road_tilts([], [], RoadProfile(CAMERA.height_m), PeopleConfig()))
+    assert road.ground.pitch_rad == before
+    road.correct_by_people(road_tilts(seen, [math.inf] * len(seen), RoadProfile(CAMERA.height_m), PeopleConfig()))
+    assert abs(road.ground.pitch_rad - before - 0.02) < 2.0 * road.sigma_pitch_rad < 0.02
+    assert road.sigma_pitch_rad < sigma_before
+    log_height, height_var = road.bodies
     assert 0.02 < log_height < 0.08 + math.sqrt(height_var)
-    road.predict(1.0, 0.005, 0.02)  # the front end's ground now has a part of it
-    assert road.leave_one_out()[-1, 0, 0] == pytest.approx(tilt - 0.005, abs=1e-3)
 
 
 def test_people_follow_the_vertical_curvature() -> None:
@@ -207,7 +206,7 @@ def test_people_follow_the_vertical_curvature() -> None:
     bent = GroundSizeFilter(CAMERA, GroundSizeConfig())
     bent.predict(0.1, 0.0, None, None, 1.0, VerticalCurvature(bend, 1e-5))
     places = []
-    for road in (ROAD, bent):
+    for road in (GroundSizeFilter(CAMERA, GroundSizeConfig()), bent):
         scene = Scene()
         for _ in range(10):
             people = scene.see(found([box]), road=road)

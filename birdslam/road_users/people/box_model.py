@@ -21,11 +21,14 @@ from birdslam.geometry.se2 import SE2
 from birdslam.road_users.people.people_boxes import PersonBox
 from birdslam.road_users.people.people_config import PeopleConfig
 from birdslam.road_users.people.people_state import FOOT, HEAD, HEIGHT, OFFSET, STATES, TILT
+from birdslam.road_users.state.ground_measurements import RoadTilts
 
 BEARING, BOTTOM, TALL, WIDTH = range(4)
 UNUSED_SIGMA = 1e3  # 1-sigma of an unused measurement
 MIN_DISTANCE_M = 0.7
 MIN_SLOPE = 1e-3
+MIN_DT_S = 1e-3
+MAX_HIDDEN_PROBABILITY = 0.01  # of the feet of a person who measures the road
 
 
 def measured_boxes(boxes: Sequence[PersonBox]) -> tuple[Floats, Floats]:
@@ -71,6 +74,31 @@ def expected_boxes(
     expected[:, :, 1, BOTTOM] -= config.hidden_share * tall[:, :, 1]
     expected[:, :, 1, TALL] += math.log(1.0 - config.hidden_share)
     return expected, J
+
+
+def road_tilts(
+    boxes: Sequence[PersonBox], unseen_s: Sequence[float], road: RoadProfile, config: PeopleConfig
+) -> RoadTilts:
+    """Tilts of the road beyond `road` at which complete boxes with visible feet have the mean height of their class.
+
+    `unseen_s` is the time since the last box of the same person. Most of the variance is that of the outline, which
+    lasts for `outline_memory_s`.
+    """
+    rows = []
+    for box, since_s in zip(boxes, unseen_s, strict=True):
+        if not box.is_complete or box.hidden > MAX_HIDDEN_PROBABILITY or box.tan_height <= MIN_SLOPE:
+            continue
+        sizes = config.sizes(box.label)
+        tall = box.tan_height / (1.0 + sizes.foot_rel + sizes.head_rel)
+        depth = sizes.height_m / tall
+        bottom = box.slope_bottom - sizes.foot_rel * tall
+        tilt = road.slope(max(depth - sizes.reach_m, MIN_DISTANCE_M)) - bottom
+        slope = road.height_m / depth
+        of_size = sizes.sigma_height_rel**2 + (2.0 * config.sigma_outline_rel) ** 2
+        variance = slope**2 * of_size + (config.sigma_kerb_m / depth) ** 2
+        variance += config.sigma_tilt_rad**2 + (config.sigma_roll_rad * box.bearing) ** 2
+        rows.append((tilt, box.bearing, slope, variance, max(1.0, config.outline_memory_s / max(since_s, MIN_DT_S))))
+    return RoadTilts(*np.array(rows).reshape(-1, 5).T)
 
 
 def hide_feet(noise: Floats, tall: Floats, config: PeopleConfig) -> None:

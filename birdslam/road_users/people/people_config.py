@@ -6,14 +6,12 @@ import msgspec
 
 from birdslam.road_users.people.people_boxes import PEDESTRIAN
 
-MIN_VARIANCE = 1e-6  # of a person's own height
-
 
 class Sizes(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Dimensions and motion of a class of people."""
 
     height_m: float  # mean of adults
-    sigma_height_rel: float  # 1-sigma of it
+    sigma_height_rel: float  # 1-sigma of it, beyond the common part of all people
     child_m: float  # mean of children
     sigma_child_rel: float  # 1-sigma of it
     child: float  # fraction of children
@@ -36,9 +34,9 @@ class PeopleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     pedestrian: Sizes = Sizes(
         height_m=1.72,
-        sigma_height_rel=0.075,
+        sigma_height_rel=0.051,
         child_m=1.2,
-        sigma_child_rel=0.15,
+        sigma_child_rel=0.14,
         child=0.06,
         width_m=0.68,
         sigma_width_rel=0.3,
@@ -55,9 +53,9 @@ class PeopleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     )
     cyclist: Sizes = Sizes(  # with the rider
         height_m=1.74,
-        sigma_height_rel=0.07,
+        sigma_height_rel=0.043,
         child_m=1.45,
-        sigma_child_rel=0.12,
+        sigma_child_rel=0.107,
         child=0.06,
         width_m=0.9,
         sigma_width_rel=0.5,
@@ -76,25 +74,17 @@ class PeopleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     crossing: float = 0.3  # fraction of moving people in any direction
     turns_after_s: float = 10.0  # mean time between changes of direction
     stop_mps: float = 0.08  # 1-sigma of the velocity of a standing person
-    sigma_tilt_rad: float = 0.008  # of the road at a person relative to the ego, beyond the front end's sigma
-    sigma_common_tilt_rad: float = 0.004  # of the common tilt under all people, beyond the front end's sigma
+    sigma_tilt_rad: float = 0.009  # of the road at a person relative to the ego, beyond the front end's sigma
     tilt_drift_rad: float = 0.003  # and its change within a second as people walk
     sigma_roll_rad: float = 0.01  # of the front end's roll, per unit of y/x
     sigma_kerb_m: float = 0.1  # 1-sigma of the ground offset under a person
-    sigma_pavement_rel: float = 0.036  # common part of it, of the camera height: 0.06 m
     hidden_share: float = 0.3  # mean hidden fraction of the height with hidden feet
     sigma_hidden_share: float = 0.35  # 1-sigma of it
     box_memory_s: float = 0.4  # correlation time of the errors of a box
     width_memory_s: float = 5.0  # correlation time of its width
     outline_memory_s: float = 2.0  # correlation time of its systematic vertical errors
     sigma_outline_rel: float = 0.06  # 1-sigma of them, of the height
-    sure_feet: float = 0.01  # maximum probability of hidden feet for a sample of the road
-    sigma_common_rel: float = 0.055  # 1-sigma of the common part of the log heights
 
     def sizes(self, label: str) -> Sizes:
         """The parameters of a label."""
         return self.pedestrian if label == PEDESTRIAN else self.cyclist
-
-    def own_height_var(self, sigma_height_rel: float) -> float:
-        """Variance of a person's log height without the common part."""
-        return float(max(sigma_height_rel**2 - self.sigma_common_rel**2, MIN_VARIANCE))

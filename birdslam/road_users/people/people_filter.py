@@ -54,7 +54,6 @@ from birdslam.road_users.people.people_state import (
     Y,
     merge_mixture,
 )
-from birdslam.road_users.people.road_tilt import SharedRoad
 
 INITIAL_DEPTH_SIGMA_REL = 0.6
 BIRTH_ITERATIONS, ITERATIONS = 4, 1
@@ -78,20 +77,18 @@ class PeopleFilter:
         self._log_height = np.zeros((0, FILTERS))  # of adults and children
         self._sizes = np.zeros((0, 6))  # reach, change, log width, sigma width, mean errors of foot and head
         self._moves = np.zeros((0, len(MOTIONS), 3))  # speed along the road, its 1-sigma, 1-sigma across the road
-        # Mean and variance of common tilt and log height from the others, and variances of the own parts
-        self._shared, self._own_var = np.zeros((0, 2, 2)), np.zeros((0, FILTERS, 2))
+        # Variances of the own parts of tilt and log height, means and variances of the common parts
+        self._own_var, self._common = np.zeros((2, 0, FILTERS)), np.zeros((2, 2))
         self._driving = 1.0  # driving fraction of a second
-        self.road = SharedRoad(config)
 
     def __len__(self) -> int:
         return len(self._x)
 
-    def keep_rows(self, rows: Sequence[int], leaving: Sequence[int]) -> None:
-        """Removes all other rows; the information of the rows `leaving` about the road stays."""
-        self.road.keep_rows(rows, leaving)
-        self._x, self._P, self._weight = self._x[rows], self._P[rows], self._weight[rows]
-        self._unseen_s, self._sizes, self._log_height = self._unseen_s[rows], self._sizes[rows], self._log_height[rows]
-        self._shared, self._own_var, self._moves = self._shared[rows], self._own_var[rows], self._moves[rows]
+    def keep_rows(self, rows: Sequence[int]) -> None:
+        """Removes all other rows."""
+        for name in ("_x", "_P", "_weight", "_unseen_s", "_sizes", "_log_height", "_moves"):
+            setattr(self, name, getattr(self, name)[rows])
+        self._own_var = self._own_var[:, rows]
 
     def predict(
         self,
@@ -101,16 +98,15 @@ class PeopleFilter:
         ground_shift_rad: float,
         driving: float,
         keep_tilt: float,
-        sigma_pitch_rad: float,
     ) -> None:
         """Predicts to the next frame; `ground_shift_rad` is the change of the ground's estimate beyond its motion.
 
         `ego_cov` (3, 3) is the covariance of the ego's step in its tangent space, `driving` the driving fraction of a
-        second, `keep_tilt` the correlation of the road's tilt with that of the last frame.
+        second, `keep_tilt` the correlation of the road's tilt at a person with that of the last frame.
         """
         config, n, keep = self.config, len(self._x), keep_tilt
         self._driving = driving
-        self.road.predict(keep, ground_shift_rad, sigma_pitch_rad)
+        self._common[0, 0] -= ground_shift_rad
         if not n or dt_s <= 0.0:
             return
         self._unseen_s += dt_s
@@ -118,12 +114,11 @@ class PeopleFilter:
             self._x, self._P, self._weight, self._moves, dt_s, T_world_ego.yaw_rad, config
         )
         self._x, self._P = predict_motion(self._x, self._P, self._sizes[:, 1], dt_s)
-        self._shared[:, 0, 0] -= ground_shift_rad
-        mean, var = self._shared[:, 0].T
-        self._x[..., TILT] = mean[:, None] + keep * (self._x[..., TILT] - ground_shift_rad - mean[:, None])
+        mean, var = self._common[0]
+        self._x[..., TILT] = mean + keep * (self._x[..., TILT] - ground_shift_rad - mean)
         self._P[..., TILT, :] *= keep
         self._P[..., TILT] *= keep
-        self._P[..., TILT, TILT] += ((1.0 - keep**2) * (var + config.sigma_tilt_rad**2))[:, None]
+        self._P[..., TILT, TILT] += (1.0 - keep**2) * (var + config.sigma_tilt_rad**2)
         self._P[..., TILT, TILT] += config.tilt_drift_rad**2 * dt_s
         keep = math.exp(-dt_s / config.outline_memory_s)
         for k, state in enumerate((FOOT, HEAD)):
@@ -143,15 +138,15 @@ class PeopleFilter:
         """Adds new people in rows after the others, and corrects them by their boxes."""
         if not boxes:
             return
-        config, n, before, shared = self.config, len(boxes), len(self._x), self.road.leave_one_out()[-1]
+        config, n, before = self.config, len(boxes), len(self._x)
         x, P = np.zeros((n, FILTERS, len(STATES))), np.zeros((n, FILTERS, len(STATES), len(STATES)))
         weight, rows = np.zeros((n, FILTERS)), np.zeros((n, 6))
         log_height = np.zeros((n, FILTERS))
-        moves, own_var = np.zeros((n, len(MOTIONS), 3)), np.zeros((n, FILTERS, 2))
+        moves, own_var = np.zeros((n, len(MOTIONS), 3)), np.zeros((2, n, FILTERS))
         for k, box in enumerate(boxes):
             sizes = config.sizes(box.label)
             moves[k] = motion_parameters(sizes, config)
-            own_var[k, :, 0] = config.sigma_tilt_rad**2 + (config.sigma_roll_rad * box.bearing) ** 2
+            own_var[0, k] = config.sigma_tilt_rad**2 + (config.sigma_roll_rad * box.bearing) ** 2
             rows[k] = [
                 sizes.reach_m, sizes.change_mps, math.log(sizes.width_m), sizes.sigma_width_rel,
                 sizes.foot_rel, -sizes.head_rel,
@@ -163,13 +158,13 @@ class PeopleFilter:
                 both = slice(len(MOTIONS) * child, len(MOTIONS) * (child + 1))
                 x[k, both, :2] = T_world_ego @ np.array([x_m, box.bearing * x_m])
                 log_height[k, both] = math.log(h_m)
-                x[k, both, HEIGHT] = math.log(h_m) + shared[1, 0]
+                x[k, both, HEIGHT] = math.log(h_m) + self._common[1, 0]
                 P[k, both, :2, :2] = np.eye(2) * (INITIAL_DEPTH_SIGMA_REL * x_m) ** 2
-                own_var[k, both, 1] = config.own_height_var(sigma)
+                own_var[1, k, both] = sigma**2
                 weight[k, both] = (sizes.child if child else 1.0 - sizes.child) * motion_priors(config)
-            x[k, :, TILT] = shared[0, 0]
             x[k, :, FOOT], x[k, :, HEAD] = sizes.foot_rel, -sizes.head_rel
-            P[k, :, [TILT, HEIGHT], [TILT, HEIGHT]] = (shared[:, 1] + own_var[k]).T
+            x[k, :, TILT] = self._common[0, 0]
+            P[k, :, [TILT, HEIGHT], [TILT, HEIGHT]] = self._common[:, 1, None] + own_var[:, k]
             P[k, :, [FOOT, HEAD], [FOOT, HEAD]] = config.sigma_outline_rel**2
             P[k, :, OFFSET, OFFSET] = config.sigma_kerb_m**2
         self._moves = np.concatenate([self._moves, moves])
@@ -179,10 +174,8 @@ class PeopleFilter:
         self._x, self._P = np.concatenate([self._x, x]), np.concatenate([self._P, P])
         self._weight = np.concatenate([self._weight, weight])
         self._sizes = np.concatenate([self._sizes, rows])
-        self._shared = np.concatenate([self._shared, np.tile(shared, (n, 1, 1))])
-        self.road.add_people(n)
         self._log_height = np.concatenate([self._log_height, log_height])
-        self._own_var = np.concatenate([self._own_var, own_var])
+        self._own_var = np.concatenate([self._own_var, own_var], axis=1)
         self._unseen_s = np.concatenate([self._unseen_s, np.full(n, max(config.box_memory_s, config.width_memory_s))])
         self.correct(range(before, before + n), boxes, T_world_ego, road, BIRTH_ITERATIONS)
 
@@ -198,7 +191,6 @@ class PeopleFilter:
         if not boxes:
             return
         at = np.asarray(rows)
-        self.road.add_boxes(rows, boxes, road)
         z, R = self._measured(at, boxes)  # (M, 4), (M, 4, 4)
         counts = np.minimum(1.0, self._unseen_s[at] / self.config.box_memory_s)[
             :, None, None
@@ -264,23 +256,22 @@ class PeopleFilter:
             cov[:, [VX, VY], [VX, VY]] += (q * after_s)[:, None]
         return Moments(mean, cov, standing, self._weight[:, CHILD_FILTERS].sum(axis=1))
 
-    def update_shared_priors(self) -> None:
-        """Replaces the prior of the common tilt and height in each filter by the current one.
+    def set_common_priors(self, priors: Floats) -> None:
+        """Replaces the priors of the common tilt and height, information of rank one in each filter.
 
-        The priors are information of rank one. The prior of the tilt fades while the ego drives, since predict() draws
+        `priors` (2, 2) are means and variances. The prior of the tilt fades while the ego drives, since predict() draws
         the tilt to the new one.
         """
-        shared = self.road.leave_one_out()[:-1]
         means = ((TILT, np.zeros((1, 1)), 1.0 - self._driving), (HEIGHT, self._log_height, 1.0))
-        for k, (state, base, kept) in enumerate(means):
-            before, now = (1.0 / (self._own_var[..., k] + part[:, None, k, 1]) for part in (self._shared, shared))
+        for (state, base, kept), own, old, new in zip(means, self._own_var, self._common, priors, strict=True):
+            before, now = 1.0 / (own + old[1]), 1.0 / (own + new[1])
             Pa = self._P[..., state]  # (N, F, S)
             change = np.maximum(kept * (now - before), -0.5 / Pa[..., state])
             gain = Pa / (1.0 + change * Pa[..., state])[..., None]
-            drawn = kept * (now * shared[:, None, k, 0] - before * self._shared[:, None, k, 0])
+            drawn = kept * (now * new[0] - before * old[0])
             self._x = self._x + gain * (drawn - change * (self._x[..., state] - base))[..., None]
             self._P = self._P - change[..., None, None] * gain[..., :, None] * Pa[..., None, :]
-        self._shared = shared
+        self._common = priors
 
     def distances(self, boxes: Sequence[PersonBox], T_world_ego: SE2, road: RoadProfile) -> tuple[Floats, Floats]:
         """(2, N, M) squared Mahalanobis distances of boxes from people, and -2 log likelihoods.

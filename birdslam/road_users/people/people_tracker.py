@@ -15,7 +15,7 @@ from birdslam.geometry.bev import RoadProfile
 from birdslam.geometry.camera import Camera
 from birdslam.perception import Detections
 from birdslam.road_users.out_of_sequence import OpenFrame
-from birdslam.road_users.people.box_model import MIN_SLOPE
+from birdslam.road_users.people.box_model import MIN_DT_S, MIN_SLOPE, road_tilts
 from birdslam.road_users.people.people_boxes import (
     BICYCLE,
     CYCLIST,
@@ -33,7 +33,6 @@ from birdslam.types import FIRST_PERSON
 
 IMPOSSIBLE_COST = 1e9
 NEW_PER_S = 1.0  # rate of new people, per unit of bearing, slope and log height
-MIN_DT_S = 1e-3
 SIDE_MARGIN = 0.03  # of the image width, beyond which a person has left
 MAX_OUTSIDE_S = 0.3  # until a person outside the image is removed
 
@@ -123,13 +122,17 @@ class PeopleTracker:
             pairs = self._associate(boxes, frame, profile)
             rows = [row for row, _ in pairs]
             self.filter.correct(rows, [boxes[k] for _, k in pairs], ego.T_world_ego, profile)
+            unseen_s = []
             for row, k in pairs:
                 track = self.tracks[row]
+                unseen_s.append((ego.t_source_ns - track.seen_ns) * 1e-9)
                 track.box, track.seen_ns, track.seen_frame = boxes[k], ego.t_source_ns, ego.frame_id
                 track.hits += 1
                 track.votes[boxes[k].label] += 1
-            self.filter.update_shared_priors()
-            self._start_tracks(boxes, {k for _, k in pairs}, frame, profile)
+            born = self._start_tracks(boxes, {k for _, k in pairs}, frame, profile)
+            seen, unseen_s = [*(boxes[k] for _, k in pairs), *born], [*unseen_s, *[math.inf] * len(born)]
+            road.correct_by_people(road_tilts(seen, unseen_s, profile, self.config.people))
+            self.filter.set_common_priors(np.array([(0.0, road.sigma_pitch_rad**2), road.bodies]))
         self._finish_frame(frame)
 
     def _predict(self, frame: OpenFrame, road: GroundSizeFilter) -> None:
@@ -138,9 +141,7 @@ class PeopleTracker:
         self._pitch_rad = pitch_rad
         driving = road.driving_share(frame.dt_s, frame.travelled_m)
         keep_tilt = math.exp(-driving * frame.dt_s / road.config.tilt_memory_s)
-        self.filter.predict(
-            frame.dt_s, ego.T_world_ego, ego.step_cov, shift_rad, driving, keep_tilt, road.sigma_pitch_rad
-        )
+        self.filter.predict(frame.dt_s, ego.T_world_ego, ego.step_cov, shift_rad, driving, keep_tilt)
 
     def _associate(self, boxes: Sequence[PersonBox], frame: OpenFrame, road: RoadProfile) -> list[tuple[int, int]]:
         """Pairs (row, box) of least total cost, -2 log likelihood within the gate."""
@@ -201,20 +202,24 @@ class PeopleTracker:
         same = np.equal.outer([box.label for box in before], [box.label for box in boxes])
         return np.where(same, cost, 0.0)
 
-    def _start_tracks(self, boxes: list[PersonBox], matched: set[int], frame: OpenFrame, road: RoadProfile) -> None:
+    def _start_tracks(
+        self, boxes: list[PersonBox], matched: set[int], frame: OpenFrame, road: RoadProfile
+    ) -> list[PersonBox]:
+        """Starts tracks of unmatched boxes, and returns these."""
         followed = np.array([boxes[k].box_px for k in matched]).reshape(-1, 4)
-        births: list[int] = []
+        births: list[PersonBox] = []
         for k, box in enumerate(boxes):
             if k in matched or box.label == BICYCLE or box.score < self.tracking.birth_score:
                 continue
             if len(followed) and iou(np.array([box.box_px]), followed).max() > self.config.birth_iou:
                 continue
-            births.append(k)
+            births.append(box)
         ego = frame.ego
-        self.filter.add_people([boxes[k] for k in births], ego.T_world_ego, road)
+        self.filter.add_people(births, ego.T_world_ego, road)
         self.tracks += [
-            PersonTrack(boxes[k], ego.t_source_ns, ego.frame_id, votes=Counter({boxes[k].label: 1})) for k in births
-        ]  # fmt: skip
+            PersonTrack(box, ego.t_source_ns, ego.frame_id, votes=Counter({box.label: 1})) for box in births
+        ]
+        return births
 
     def _finish_frame(self, frame: OpenFrame) -> None:
         """Removes lost tracks, assigns ids, decides which people are standing."""
@@ -235,8 +240,7 @@ class PeopleTracker:
                 alive.append((math.hypot(x_m, y_m), row))
         rows = sorted(row for _, row in sorted(alive)[: self.config.most])
         if len(rows) < len(self.tracks):
-            gone = set(range(len(self.tracks))) - set(rows)
-            self.filter.keep_rows(rows, [row for row in sorted(gone) if self.tracks[row].person >= 0])
+            self.filter.keep_rows(rows)
             self.tracks = [self.tracks[row] for row in rows]
         for track, standing in zip(self.tracks, moments.standing[rows].tolist(), strict=True):
             if track.person < 0 and track.hits >= self.tracking.confirm_hits:

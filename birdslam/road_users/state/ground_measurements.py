@@ -9,6 +9,7 @@ road rises by pitch + tilt + v (z - PLANE_AT_M) / 2 - roll y/x - crown |y|/x wit
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -19,12 +20,27 @@ from birdslam.geometry import bev
 Floats = NDArray[np.float64]
 
 # Common states: tilt of the camera over the road, its crown, systematic errors of the tilt by images, common errors of
-# sizes and of lower edges, vertical curvature
-PITCH, ROLL, CROWN, IMAGE_PITCH, IMAGE_ROLL, SIZE, LOWER, VERTICAL = range(8)
-COMMON, OWN = 8, 4  # numbers of common states, and of states per vehicle
+# sizes and of lower edges, vertical curvature, common error of the heights of people over the road
+PITCH, ROLL, CROWN, IMAGE_PITCH, IMAGE_ROLL, SIZE, LOWER, VERTICAL, BODY = range(9)
+COMMON, OWN = 9, 4  # numbers of common states, and of states per vehicle
 HEIGHT, OUTLINE, EDGE, TILT = range(OWN)
 Cue = Literal["bottom", "top", "width"]
 CUES: tuple[Cue, ...] = ("bottom", "top", "width")  # measurements per box, in this order
+
+
+@dataclass(frozen=True)
+class RoadTilts:
+    """Tilts (N,) of the road beyond the estimated ground, each by a box of a person of its class's height.
+
+    `slope` is the derivative by a log factor on the height, `variance` that of one person, and `correlated` the
+    number of successive boxes that count as one.
+    """
+
+    tilt_rad: Floats
+    bearing: Floats
+    slope: Floats
+    variance: Floats
+    correlated: Floats
 
 
 def expected_boxes(

@@ -50,6 +50,10 @@ class GroundSizeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     image_roll_memory_s: float = 5.0  # the same of the roll
     box_memory_s: float = 0.5  # correlation time of the errors of a box, in driving time
 
+    # Common relative offset of the heights of people, and common height of the pavement relative to the camera's
+    sigma_bodies_rel: float = 0.055
+    sigma_pavement_rel: float = 0.036  # 1-sigma of the latter
+
     @property
     def image_var(self) -> NDArray[np.float64]:
         """(2,) variances of the systematic errors of pitch and roll by images."""

@@ -1,6 +1,6 @@
-"""Joint Kalman filter of the road's tilt and the vehicles' sizes, from the boxes of the vehicles.
+"""Joint Kalman filter of the road's tilt and the vehicles' sizes, from the boxes of all road users.
 
-    x = [pitch, roll, crown, errors of the images' tilt, common size and edge, vertical curvature,
+    x = [pitch, roll, crown, errors of the images' tilt, common size and edge, vertical curvature, size of people,
          and of every vehicle: log h, log w, edge, tilt]      and, for one frame only, of every box: log z
 
 Systematic errors of a drive or a track are states, so that they do not average out over frames. Measurements:
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from birdslam.geometry.camera import Camera, GroundPlane, VerticalCurvature
 from birdslam.road_users.placement.localisation import Dimensions, Observation
 from birdslam.road_users.state.ground_measurements import (
+    BODY,
     COMMON,
     CROWN,
     CUES,
@@ -35,6 +36,7 @@ from birdslam.road_users.state.ground_measurements import (
     SIZE,
     TILT,
     VERTICAL,
+    RoadTilts,
     expected_boxes,
     robust_information,
 )
@@ -46,6 +48,7 @@ Floats = NDArray[np.float64]
 
 ITERATIONS = 2
 CURVATURE_ITERATIONS = 5
+PEOPLE_ITERATIONS = 4
 FLAT_VARIANCE = 1e-16  # of the vertical curvature without lanes: the road is a plane
 INITIAL_DEPTH_SIGMA_LOG = 2.0
 UNUSED_SIGMA = 1e3  # 1-sigma of an unused cue
@@ -69,10 +72,11 @@ class GroundSizeFilter:
     """Calls per frame: predict(), then estimate_depths().
 
     State: pitch and roll (rad) of the camera over the road, crown (rad), systematic errors of the tilt by images;
-    common log factor on heights, common offset of lower edges relative to the height; of each vehicle log height (m),
-    log factor on the width of its outline, edge (m) and tilt (rad). Measurements: bottom and top slopes and log width
-    of each box; pitch and roll (rad) by images. Readers: `placing.Placing` for depths and heights;
-    `localisation.observe_boxes`, association, lanes and landmarks for `ground`.
+    common log factor on heights, common offset of lower edges relative to the height, common log factor on the heights
+    of people; of each vehicle log height (m), log factor on the width of its outline, edge (m) and tilt (rad).
+    Measurements: bottom and top slopes and log width of each box; tilt by people; pitch and roll (rad) by images.
+    Readers: `placing.Placing` for depths and heights; `localisation.observe_boxes`, association, people, lanes and
+    landmarks for `ground`.
     """
 
     def __init__(self, camera: Camera, config: GroundSizeConfig) -> None:
@@ -82,8 +86,9 @@ class GroundSizeFilter:
         self._driven_s = np.zeros(0)  # driving time of the ego in it
         self._sigma_tilt = np.zeros(0)
         self._x = np.array([camera.pitch_rad, camera.roll_rad, *np.zeros(COMMON - 2)])
+        self._body_var = config.sigma_bodies_rel**2 + config.sigma_pavement_rel**2
         common = np.square([config.sigma_common_rel, config.sigma_common_edge_rel])
-        self._P = np.diag([*config.road_var, *config.image_var, *common, FLAT_VARIANCE])
+        self._P = np.diag([*config.road_var, *config.image_var, *common, FLAT_VARIANCE, self._body_var])
         self._sizes = SizePrior(config.sigma_common_rel, config.size_dof)
         self._image_ground = camera.ground
 
@@ -114,6 +119,13 @@ class GroundSizeFilter:
     def sigma_vertical_per_m(self) -> float:
         """1-sigma of the vertical curvature."""
         return math.sqrt(float(self._P[VERTICAL, VERTICAL]))
+
+    @property
+    def bodies(self) -> tuple[float, float]:
+        """Common log factor on the heights of people, and its variance; the rest of the state is the pavement's."""
+        of_bodies = self.config.sigma_bodies_rel**2
+        share = of_bodies / self._body_var
+        return share * float(self._x[BODY]), share**2 * float(self._P[BODY, BODY]) + (1.0 - share) * of_bodies
 
     @property
     def tilt_cov(self) -> Floats:
@@ -329,10 +341,29 @@ class GroundSizeFilter:
         sigma_rel = np.array([self.config.image_pitch_sigma_rel, 1.0])
         PHt = self._P[:, _TILTS] + self._P[:, _IMAGES]
         gain = PHt @ np.linalg.inv(PHt[_TILTS] + PHt[_IMAGES] + cov * np.outer(sigma_rel, sigma_rel))
-        gain[VERTICAL] = 0.0
         expected = self._x[_TILTS] + self._x[_IMAGES]
-        self._x = self._x + gain @ (np.array([by_images.pitch_rad, by_images.roll_rad]) - expected)
-        P = self._P - gain @ PHt.T
+        self._update(gain, np.array([by_images.pitch_rad, by_images.roll_rad]) - expected, PHt)
+
+    def correct_by_people(self, people: RoadTilts) -> None:
+        """Updates with the boxes of people; outliers are children and people with hidden feet (Cauchy)."""
+        if not len(people.tilt_rad):
+            return
+        J = np.zeros((len(people.tilt_rad), len(self._x)))
+        J[:, PITCH], J[:, ROLL], J[:, BODY] = 1.0, -people.bearing, people.slope
+        innovation = people.tilt_rad - people.slope * self._x[BODY]
+        PJt = self._P @ J.T
+        S = J @ PJt
+        residual = np.zeros(len(innovation))
+        for _ in range(PEOPLE_ITERATIONS):
+            outlying = 1.0 + np.square(residual) / people.variance / 4.0
+            gain = PJt @ np.linalg.inv(S + np.diag(people.variance * people.correlated * outlying))
+            residual = innovation - J @ (gain @ innovation)
+        self._update(gain, innovation, PJt)
+
+    def _update(self, gain: Floats, innovation: Floats, PJt: Floats) -> None:
+        gain[VERTICAL] = 0.0
+        self._x = self._x + gain @ innovation
+        P = self._P - gain @ PJt.T
         P[VERTICAL] = P[:, VERTICAL]
         self._P = (P + P.T) / 2.0
 
