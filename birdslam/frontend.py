@@ -207,7 +207,7 @@ class FrontEnd:
         if isinstance(self.odometry, Odometry):
             self.odometry.reset()
         self._lanes.clear()
-        self._start(self.vehicles.tracker.next_id, self.people.next_id)
+        self._start(self.vehicles.tracker.life.next_id, self.people.life.next_id)
 
     def _move(self, frame: Frame, tracks: Any, perception: Perception) -> tuple[Motion | None, EgoEdge | None]:
         """The ego's motion in metres and its CC edge; None if the motion since earlier frames is unknown."""

@@ -97,7 +97,7 @@ class BirdSLAM:
         if detections is None:
             return measurements, estimate
         tracks = self.frontend.vehicles.tracker.tracks
-        people = [(p.person, p.box.rows) for p in self.frontend.people.tracks if p.seen_frame == frame.frame_id]
+        people = [(p.number, p.box.rows) for p in self.frontend.people.tracks if p.frame.frame_id == frame.frame_id]
         return measurements, estimate, place_boxes(len(detections), frame.frame_id, tracks, people, estimate)
 
     def map_update(self) -> MapUpdate | None:

@@ -127,7 +127,7 @@ def test_ids_of_external_tracker_are_kept() -> None:
         detections = external_detections(boxes, ["car"] * 3, track_ids=ids)
         tracks = tracker.localise_vehicles(EgoFrame(frame, frame * 100_000_000, SE2()), detections)
         if frame:
-            assert {track.vehicle: track.observation.row for track in tracks} == {int(ids[0]): 0, int(ids[1]): 1}
+            assert {track.number: track.observation.row for track in tracks} == {int(ids[0]): 0, int(ids[1]): 1}
 
 
 def test_only_filters_ids_along_with_boxes() -> None:

@@ -12,7 +12,7 @@ from birdslam.road_users.placement.depth_fusion import DepthPlace
 from birdslam.road_users.placement.localisation import LocalisationConfig, iou, observe_boxes
 from birdslam.road_users.state.ground_size_config import GroundSizeConfig
 from birdslam.road_users.state.ground_size_filter import GroundSizeFilter
-from birdslam.road_users.track import EgoFrame, Track, TrackingConfig
+from birdslam.road_users.track import EgoFrame, TrackingConfig, VehicleTrack
 from birdslam.road_users.tracking import Tracker
 from tests.boxes import cuboid_px, footprint_m
 from tests.recordings import KITTI as CAMERA
@@ -39,7 +39,7 @@ class Drive:
         self.noise_px = noise_px
         self.frame = 0
 
-    def step(self, T_world_ego: SE2, vehicles: list[SE2], labels: list[str] | None = None) -> list[Track]:
+    def step(self, T_world_ego: SE2, vehicles: list[SE2], labels: list[str] | None = None) -> list[VehicleTrack]:
         boxes = [box_px(T_world_ego.between(vehicle)) for vehicle in vehicles]
         kept = [i for i, box in enumerate(boxes) if box is not None]
         px = np.array([boxes[i] for i in kept]).reshape(-1, 4)
@@ -58,7 +58,7 @@ def test_parked_cars_keep_their_ids_and_places_as_the_ego_passes() -> None:
     place_of: dict[int, list[SE2]] = {}
     for k in range(60):
         for track in drive.step(SE2(0.8 * k, 0.0, 0.0), parked):
-            place_of.setdefault(track.vehicle, []).append(track.pose())
+            place_of.setdefault(track.number, []).append(track.pose())
     assert len(place_of) == len(parked)
     for poses in place_of.values():
         nearest = min(parked, key=lambda p: math.hypot(p.x_m - poses[-1].x_m, p.y_m - poses[-1].y_m))
@@ -90,18 +90,18 @@ def test_a_gap_shorter_than_forget_s_keeps_the_id() -> None:
     for k in range(40):
         car = SE2(15.0 + 1.2 * k, 0.5, 0.0)
         hidden = 15 <= k < 21
-        ids |= {t.vehicle for t in drive.step(SE2(1.0 * k, 0.0, 0.0), [] if hidden else [car])}
+        ids |= {t.number for t in drive.step(SE2(1.0 * k, 0.0, 0.0), [] if hidden else [car])}
     assert ids == {0}
 
 
 def test_stationary_car_takes_no_neighbouring_box_after_a_gap() -> None:
-    drive, near, tracks = Drive(noise_px=0.3), SE2(60.0, -4.0, 0.0), list[Track]()
+    drive, near, tracks = Drive(noise_px=0.3), SE2(60.0, -4.0, 0.0), list[VehicleTrack]()
     for k in range(22):
         tracks = drive.step(SE2(0.6 * k, 0.0, 0.0), [near])
     assert tracks[0].is_stationary
     for k in range(22, 24):
         drive.step(SE2(0.6 * k, 0.0, 0.0), [])
-    ids = {t.vehicle for k in range(24, 27) for t in drive.step(SE2(0.6 * k, 0.0, 0.0), [SE2(61.5, -5.5, 0.0)])}
+    ids = {t.number for k in range(24, 27) for t in drive.step(SE2(0.6 * k, 0.0, 0.0), [SE2(61.5, -5.5, 0.0)])}
     assert ids == {1}  # its box overlaps by a fifth, and the car is expected to within a fifth of its width
 
 
@@ -110,13 +110,13 @@ def test_a_gap_longer_than_forget_s_gives_a_new_id() -> None:
     ids = set()
     for k in range(40):
         hidden = 10 <= k < 25
-        ids |= {t.vehicle for t in drive.step(SE2(), [] if hidden else [SE2(15.0, 0.0, 0.0)])}
+        ids |= {t.number for t in drive.step(SE2(), [] if hidden else [SE2(15.0, 0.0, 0.0)])}
     assert ids == {0, 1}
 
 
 def test_heading_of_an_oncoming_car_follows_its_motion() -> None:
     drive = Drive(noise_px=0.3)
-    tracks: list[Track] = []
+    tracks: list[VehicleTrack] = []
     for k in range(15):
         tracks = drive.step(SE2(), [SE2(45.0 - 1.0 * k, 3.5, math.pi)])
     (track,) = tracks
@@ -130,7 +130,7 @@ def test_crossing_cars_do_not_swap_ids() -> None:
     for k in range(45):
         cars = [SE2(18.0, -8.0 + 0.4 * k, math.pi / 2), SE2(30.0, 8.0 - 0.4 * k, -math.pi / 2)]
         for track in drive.step(SE2(), cars):
-            history.setdefault(track.vehicle, []).append(float(track.state[0]))
+            history.setdefault(track.number, []).append(float(track.state[0]))
     assert len(history) == 2
     for depths in history.values():
         assert np.ptp(depths) < 4.0
@@ -144,7 +144,7 @@ def test_labels_are_voted_and_false_alarms_have_no_id() -> None:
             drive.step(SE2(), [SE2(15.0, 0.0, 0.0), SE2(20.0, 6.0, 0.0)])
     assert [t.label for t in tracks] == ["car"]
     assert len(drive.tracker.tracks) == 1
-    assert tracks[0].vehicle == 0
+    assert tracks[0].number == 0
 
 
 def test_single_truck_label_changes_neither_size_nor_position() -> None:
@@ -176,7 +176,7 @@ def test_corrected_label_changes_the_size_prior() -> None:
 def test_position_from_depth_is_weighted_by_covariance() -> None:
     def after(sigma_m: float | None) -> tuple[float, float]:
         drive = Drive()
-        tracks: list[Track] = []
+        tracks: list[VehicleTrack] = []
         for k in range(6):
             box = box_px(SE2(25.0, 1.0, 0.0))
             assert box is not None
@@ -201,7 +201,7 @@ def test_position_from_depth_is_weighted_by_covariance() -> None:
 
 def test_stationary_vehicle_keeps_its_yaw_while_size_is_estimated() -> None:
     drive = Drive(noise_px=0.3)
-    tracks: list[Track] = []
+    tracks: list[VehicleTrack] = []
     for k in range(45):
         tracks = drive.step(SE2(0.9 * k, 0.0, 0.0), [SE2(65.0, 4.0, 0.0)])
     (track,) = tracks
@@ -224,7 +224,7 @@ def test_unusual_size_keeps_its_id_while_size_is_estimated() -> None:
         )
         drive.ground_size.predict(0.1, 0.0, None, None)
         for track in drive.tracker.update(EgoFrame(k, k * PERIOD_NS, ego), seen):
-            ids.add(track.vehicle)
+            ids.add(track.number)
             errors.append(float((ego @ track.place.centre_m)[0]) - 70.0)
     assert ids == {0}
     assert abs(errors[0]) > 15.0  # taken for a car as cars are
@@ -238,7 +238,7 @@ class Looks:
         self.drive = Drive(config)
         self.frame = 0
 
-    def see(self, at: SE2, said_rad: float, flip: float = 0.05, sigma_rad: float = 0.1) -> Track | None:
+    def see(self, at: SE2, said_rad: float, flip: float = 0.05, sigma_rad: float = 0.1) -> VehicleTrack | None:
         box = box_px(at)
         assert box is not None
         seen = observe_boxes(
@@ -308,7 +308,7 @@ def test_car_is_not_associated_with_objects_behind_it(label: str) -> None:
     shown = drive.tracker.update(EgoFrame(drive.frame, drive.frame * PERIOD_NS, ego), seen)
     assert shown == []
     drive.frame += 1
-    (again,) = [track for track in drive.step(ego, [car]) if track.vehicle == known.vehicle]
+    (again,) = [track for track in drive.step(ego, [car]) if track.number == known.number]
     assert again.pose().x_m == pytest.approx(before_m, abs=1.0)  # the road learns of the odd boxes too
 
 
@@ -331,8 +331,8 @@ def test_lost_car_does_not_pass_its_id_to_a_parked_one() -> None:
     """The nearer car of a row is missed for good: the farther one's box, which overlaps its own, is another car's."""
     drive = Drive()
     near, far = SE2(20.0, -4.0), SE2(21.5, -5.6)
-    known = {track.vehicle for k in range(10) for track in drive.step(SE2(0.3 * k, 0.0), [near])}
-    others = {track.vehicle for k in range(10, 13) for track in drive.step(SE2(0.3 * k, 0.0), [far])}
+    known = {track.number for k in range(10) for track in drive.step(SE2(0.3 * k, 0.0), [near])}
+    others = {track.number for k in range(10, 13) for track in drive.step(SE2(0.3 * k, 0.0), [far])}
     assert len(known) == len(others) == 1
     assert known != others
 

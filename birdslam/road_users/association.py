@@ -13,7 +13,7 @@ from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.road_users.placement.localisation import MIN_DISTANCE_M, Observation
-from birdslam.road_users.track import Track
+from birdslam.road_users.track import VehicleTrack
 
 MAX_SIGMA_HEIGHT_REL = 0.2  # of the height of a box that measures the size
 MIN_TAN_HEIGHT = 1e-3  # of a box's height at a depth of 1
@@ -22,7 +22,7 @@ HORIZON_M = 1e4  # distance of a road point that is imaged at the horizon
 
 
 def predict_boxes_px(
-    tracks: Sequence[Track], camera: Camera, T_world_ego: SE2, ground: GroundPlane
+    tracks: Sequence[VehicleTrack], camera: Camera, T_world_ego: SE2, ground: GroundPlane
 ) -> NDArray[np.float64]:
     """Predicts the box of each track in the current image, (N, 4); NaN behind the camera or out of view.
 
@@ -57,7 +57,7 @@ def predict_boxes_px(
     return boxes
 
 
-def _depth_span_m(track: Track) -> float:
+def _depth_span_m(track: VehicleTrack) -> float:
     """Extent of a vehicle along the line of sight."""
     yaw_rad = track.yaw_rad - track.frame.T_world_ego.yaw_rad
     size = track.observation.dimensions
@@ -92,14 +92,14 @@ def assign_track_ids(observations: Sequence[Observation], track_ids: NDArray[np.
     ]
 
 
-def match_track_ids(tracks: Sequence[Track], observations: Sequence[Observation]) -> list[tuple[int, int]]:
+def match_track_ids(tracks: Sequence[VehicleTrack], observations: Sequence[Observation]) -> list[tuple[int, int]]:
     """Pairs (row of a track, its observation) by the ids of another tracker."""
     rows = {track.observation.track_id: row for row, track in enumerate(tracks)}
     return [(rows[seen.track_id], k) for k, seen in enumerate(observations) if seen.track_id in rows]
 
 
 def within_gate(
-    tracks: Sequence[Track], observations: Sequence[Observation], T_world_ego: SE2, gate_sigma: float
+    tracks: Sequence[VehicleTrack], observations: Sequence[Observation], T_world_ego: SE2, gate_sigma: float
 ) -> NDArray[np.bool_]:
     """(tracks, observations) which pairs pass the gate, by the height of the box and the track's learned size.
 
@@ -136,7 +136,7 @@ def within_gate(
     return out
 
 
-def _learned_height_m(track: Track) -> float:
+def _learned_height_m(track: VehicleTrack) -> float:
     """Height of the vehicle from its last box and the depth of its place; NaN if it is not measured."""
     seen = track.observation
     return track.place.depth_m * seen.tan_height if _is_height_measured(seen) else math.nan

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from birdslam.geometry.camera import GroundPlane, VerticalCurvature
 from birdslam.perception import DepthMap, Detections
 from birdslam.road_users.state.ground_size_filter import GroundSizeFilter
-from birdslam.road_users.track import EgoFrame, Track
+from birdslam.road_users.track import EgoFrame, VehicleTrack
 from birdslam.road_users.tracking import Tracker
 
 
@@ -81,13 +81,13 @@ class OutOfSequenceTracker:
         depth: DepthMap | None = None,
         road: NDArray[np.bool_] | None = None,
         awaited_from: int = 0,
-    ) -> list[Track]:
+    ) -> list[VehicleTrack]:
         """Returns the confirmed tracks with detections in `detected_frame`, as of that frame, ordered by id.
 
         Detections of a frame are used once, and arrive in order. `depth` and the mask `road` (H, W) are of the same
         frame or None. No more detections arrive for frames before `awaited_from`.
         """
-        tracks: list[Track] = []
+        tracks: list[VehicleTrack] = []
         awaited = any(frame.ego.frame_id == detected_frame for frame in self._open)
         if detections is not None and awaited and detected_frame > self._used_frame:
             self._used_frame = detected_frame
@@ -110,7 +110,7 @@ class OutOfSequenceTracker:
         detections: Detections | None,
         depth: DepthMap | None = None,
         road: NDArray[np.bool_] | None = None,
-    ) -> list[Track]:
+    ) -> list[VehicleTrack]:
         """Settles the oldest open frame, with or without detections. `road` must be predicted again afterwards."""
         frame = self._open.popleft()
         self.road = self.ground_size

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.se2 import SE2
-from birdslam.road_users.track import Track
+from birdslam.road_users.track import VehicleTrack
 from birdslam.types import Cov2, Estimate, VehicleEstimate
 
 
@@ -61,7 +61,7 @@ class PlacedBox(msgspec.Struct, frozen=True, kw_only=True):
 def place_boxes(
     count: int,
     frame_id: int,
-    tracks: Sequence[Track],
+    tracks: Sequence[VehicleTrack],
     people: Sequence[tuple[int, Sequence[int]]],
     estimate: Estimate,
 ) -> tuple[PlacedBox | None, ...]:
@@ -73,7 +73,7 @@ def place_boxes(
     placed: list[PlacedBox | None] = [None] * count
     for track in tracks:
         if track.frame.frame_id == frame_id:
-            vehicle = reported.get(track.vehicle)
+            vehicle = reported.get(track.number)
             placed[track.observation.row] = (
                 _place_from_track(track) if vehicle is None else _place_from_estimate(vehicle, estimate.T_world_ego)
             )
@@ -84,7 +84,7 @@ def place_boxes(
     return tuple(placed)
 
 
-def _place_from_track(track: Track) -> PlacedBox:
+def _place_from_track(track: VehicleTrack) -> PlacedBox:
     x_m, y_m = track.place.centre_m.tolist()
     yaw_rad = SE2(0.0, 0.0, track.frame.T_world_ego.yaw_rad).between(SE2(0.0, 0.0, track.yaw_rad)).yaw_rad
     return PlacedBox(x_m=x_m, y_m=y_m, cov=_row_major(track.place.cov), yaw_rad=yaw_rad, label=track.label)

@@ -43,7 +43,7 @@ from birdslam.road_users.state.parallax import LearnedSize, Parallax
 from birdslam.road_users.state.parallax_config import ParallaxConfig
 from birdslam.road_users.state.parallax_measurements import measure_boxes
 from birdslam.road_users.state.yaw_by_outline import YawByOutline
-from birdslam.road_users.track import Track
+from birdslam.road_users.track import VehicleTrack
 
 Floats = NDArray[np.float64]
 
@@ -56,7 +56,7 @@ class Assignment:
     """
 
     row: int
-    track: Track | None
+    track: VehicleTrack | None
     observation: Observation
     by_depth: DepthPlace | None = None
 

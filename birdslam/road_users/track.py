@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import msgspec
 import numpy as np
@@ -79,19 +77,19 @@ class LastEdge:
     T_world_vehicle: SE2
 
 
-class VehicleFilter(Protocol):
-    """States of all tracked vehicles; row k is that of the k-th track, from birth to deletion.
-
-    `Placing` appends rows for new vehicles; the tracker removes rows from all filters at once.
-    """
-
-    def __len__(self) -> int: ...
-
-    def keep_rows(self, rows: Sequence[int]) -> None: ...
-
-
-@dataclass
+@dataclass(kw_only=True)
 class Track:
+    """A tracked road user."""
+
+    frame: EgoFrame  # of the last box
+    number: int = -1  # persistent id, once confirmed
+    hits: int = 1
+    missed: int = 0  # number of frames with detections since the last box
+    votes: Counter[str] = field(default_factory=Counter)  # labels of its boxes
+
+
+@dataclass(kw_only=True)
+class VehicleTrack(Track):
     """One vehicle; `state` is (x_m, y_m, vx_mps, vy_mps) of its centre in the odometry world, `cov` (4, 4)."""
 
     state: NDArray[np.float64]
@@ -101,12 +99,7 @@ class Track:
     place: Place  # its place in the ego of `frame`
     first_m: NDArray[np.float64]  # (2,) first position in the odometry world
     first_offset_m: NDArray[np.float64]  # (2,) from the ego to it, in world axes
-    frame: EgoFrame  # of the last observation
     last_edge: LastEdge | None = None  # None before the track has an id
-    vehicle: int = -1  # persistent id, once confirmed
-    hits: int = 1
-    missed: int = 0  # number of frames with detections since the last observation
-    votes: Counter[str] = field(default_factory=Counter)
     sigma_yaw_rad: float = 0.0  # of a yaw measured by motion or body
     is_yaw_known: bool = False
     front_logit: float = 0.0  # log odds that the yaw points to the front

@@ -18,6 +18,7 @@ from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2, wrap
 from birdslam.perception import DepthMap, Detections
 from birdslam.road_users.association import assign_track_ids, at_border, match_track_ids, predict_boxes_px, within_gate
+from birdslam.road_users.life_cycle import LifeCycle
 from birdslam.road_users.placement.depth_fusion import DepthPlace, PseudoLidarConfig
 from birdslam.road_users.placement.localisation import (
     MIN_DISTANCE_M,
@@ -32,7 +33,7 @@ from birdslam.road_users.placement.pseudolidar import FrustumNetwork, locate_by_
 from birdslam.road_users.placing import Assignment, Placing
 from birdslam.road_users.state.ground_size_filter import GroundSizeFilter
 from birdslam.road_users.state.yaw_filter import YawFilter
-from birdslam.road_users.track import EgoFrame, Track, TrackingConfig, VehicleFilter, in_vehicle_axes
+from birdslam.road_users.track import EgoFrame, TrackingConfig, VehicleTrack, in_vehicle_axes
 from birdslam.types import MotionEdge
 
 Floats = NDArray[np.float64]
@@ -58,9 +59,6 @@ class Tracker:
         frustum_network: FrustumNetwork | None = None,
         first_id: int = 0,
     ) -> None:
-        from scipy.optimize import linear_sum_assignment  # lazy: 9 MB that only the tracking process needs
-
-        self._assign = linear_sum_assignment
         self.camera = camera
         self.config = config
         self.localisation = localisation
@@ -69,14 +67,14 @@ class Tracker:
         self.ground_size = ground_size
         self.placing = Placing(ground_size, localisation, config.parallax, self.pseudolidar, config.heading)
         self.yaw = YawFilter(config, localisation, ground_size)
-        self.tracks: list[Track] = []
-        self._filters: tuple[VehicleFilter, ...] = (  # with one row per track
-            self.placing.parallax,
-            ground_size,
-            self.placing.yaw_by_outline,
-        )
-        self.next_id = first_id
+        filters = self.placing.parallax, ground_size, self.placing.yaw_by_outline  # with one row per track
+        self.life = LifeCycle[VehicleTrack](config, config.forget_s, filters, first_id)
         self._last: EgoFrame | None = None
+
+    @property
+    def tracks(self) -> list[VehicleTrack]:
+        """The tracked vehicles."""
+        return self.life.tracks
 
     def localise_vehicles(
         self,
@@ -84,7 +82,7 @@ class Tracker:
         detections: Detections | None,
         depth: DepthMap | None = None,
         road: NDArray[np.bool_] | None = None,
-    ) -> list[Track]:
+    ) -> list[VehicleTrack]:
         """Returns the confirmed tracks with detections in this frame, ordered by id.
 
         The ground and size filter must be at this frame. `depth` and the mask `road` (H, W) are of this frame, or None.
@@ -121,15 +119,15 @@ class Tracker:
         frame: EgoFrame,
         observations: list[Observation] | None,
         by_depth: Sequence[DepthPlace | None] = (),
-    ) -> list[Track]:
+    ) -> list[VehicleTrack]:
         """Predicts, associates, places, corrects, creates and deletes tracks; returns the confirmed observed ones.
 
         `by_depth` has the place by depth of each observation, or is empty. `observations` is None if no detector
         processed this frame.
         """
         self._predict(frame)
-        for known in self.tracks:
-            known.missed += observations is not None
+        if observations is not None:
+            self.life.count_missed()
         assignments = self._assignments(frame, observations or [], by_depth)
         self._reclassify(assignments, frame.T_world_ego)
         places = self.placing.locate(assignments, frame.T_world_ego)
@@ -138,8 +136,8 @@ class Tracker:
             if assignment.track is None:
                 self.tracks.append(self._start_track(assignment, where, frame))
                 self.yaw.correct_by_outline(assignment.row, self.tracks[-1], self.placing.yaw_by_outline)
-        self._delete_lost(frame)
-        return self._confirmed(frame)
+        self.life.delete_lost(frame.t_source_ns)
+        return self.life.confirm(frame, lambda track: track.observation.track_id)
 
     def _predict(self, frame: EgoFrame) -> None:
         last = frame if self._last is None else self._last
@@ -162,9 +160,8 @@ class Tracker:
     ) -> list[Assignment]:
         """Assignments of observations to known tracks, then those of new tracks, each with its place by depth."""
         known = self._associate(frame.T_world_ego, observations)
-        matched = {k for _, k in known}
-        births = [k for k, o in enumerate(observations) if k not in matched and o.score >= self.config.birth_score]
-        tracks: list[Track | None] = [*self.tracks, *(None for _ in births)]
+        births = self.life.births([o.score for o in observations], (k for _, k in known))
+        tracks: list[VehicleTrack | None] = [*self.tracks, *(None for _ in births)]
         pairs = [*known, *enumerate(births, len(self.tracks))]
         return [
             Assignment(
@@ -176,7 +173,7 @@ class Tracker:
             for row, k in pairs
         ]
 
-    def _with_voted_class(self, track: Track | None, seen: Observation) -> Observation:
+    def _with_voted_class(self, track: VehicleTrack | None, seen: Observation) -> Observation:
         """The observation with the dimensions of its track's most frequent class."""
         label = seen.label if track is None else track.label_with(seen.label)
         if label == seen.label:
@@ -203,8 +200,7 @@ class Tracker:
         more = overlap - self._min_overlaps(predicted)[:, None]
         possible = (more >= 0.0) & within_gate(self.tracks, observations, T_world_ego, self.config.gate_sigma)
         # A missing box costs as much as one at the bound, so that no box is shifted to another track
-        rows, columns = self._assign(np.where(possible, -more, 0.0))
-        return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if possible[i, j]]
+        return self.life.associate(-more, possible, 0.0)
 
     def _min_overlaps(self, predicted_px: Floats) -> Floats:
         """(N,) minimum overlap of an observation with each predicted box (N, 4).
@@ -260,10 +256,8 @@ class Tracker:
                 track.cov[:2, :2] = R_seen[k]
             else:
                 track.state, track.cov = corrected[k], corrected_cov[k]
-            track.observation, track.place, track.frame = assignment.observation, seen, frame
-            track.hits += 1
-            track.missed = 0
-            track.votes[assignment.observation.label] += 1
+            track.observation, track.place = assignment.observation, seen
+            self.life.observe(track, frame, assignment.observation.label)
             self.yaw.correct_by_motion(assignment.row, track)
             self.yaw.correct_by_body(assignment.row, track, assignment.by_depth)
             self.yaw.correct_by_outline(assignment.row, track, self.placing.yaw_by_outline)
@@ -275,7 +269,7 @@ class Tracker:
         states[which] -= (gain @ states[which, 2:, None])[..., 0]
         covs[which] -= gain @ covs[which, 2:]
 
-    def _predicted_motion(self, track: Track, frame: EgoFrame) -> MotionEdge | None:
+    def _predicted_motion(self, track: VehicleTrack, frame: EgoFrame) -> MotionEdge | None:
         """VV edge by constant velocity; None for a track without a CV edge."""
         if track.last_edge is None:
             return None
@@ -284,14 +278,14 @@ class Tracker:
         by_acceleration = (self.config.sigma_accel_mps2 * dt_s**2 / 2.0) ** 2
         xx, xy, yy = xx * dt_s**2 + by_acceleration, xy * dt_s**2, yy * dt_s**2 + by_acceleration
         return MotionEdge(
-            vehicle=track.vehicle,
+            vehicle=track.number,
             from_frame=track.last_edge.frame,
             to_frame=frame.frame_id,
             T_from_to=track.last_edge.T_world_vehicle.between(track.pose()),
             cov=(xx, xy, 0.0, xy, yy, 0.0, 0.0, 0.0, (self.config.sigma_yaw_rate_radps * dt_s) ** 2),
         )
 
-    def _start_track(self, assignment: Assignment, seen: Place, frame: EgoFrame) -> Track:
+    def _start_track(self, assignment: Assignment, seen: Place, frame: EgoFrame) -> VehicleTrack:
         observation, by_depth = assignment.observation, assignment.by_depth
         if by_depth is not None and not by_depth.has_front:
             by_depth = None
@@ -300,7 +294,7 @@ class Tracker:
         cov = np.zeros((4, 4))
         cov[:2, :2] = R @ seen.cov @ R.T
         cov[2:, 2:] = np.eye(2) * self.config.sigma_birth_mps**2
-        return Track(
+        return VehicleTrack(
             state=np.concatenate([T_world_ego @ seen.centre_m, np.zeros(2)]),
             cov=cov,
             yaw_rad=wrap(T_world_ego.yaw_rad + assignment.yaw_rad(T_world_ego, self.config.heading)),
@@ -314,30 +308,3 @@ class Tracker:
             is_yaw_known=by_depth is not None,
             front_logit=0.0 if by_depth is None else by_depth.front_logit,
         )
-
-    def _delete_lost(self, frame: EgoFrame) -> None:
-        """Deletes tracks without recent observations, and their rows in all filters."""
-        rows = [row for row, track in enumerate(self.tracks) if not self._is_lost(track, frame.t_source_ns)]
-        if len(rows) < len(self.tracks):
-            self.tracks = [self.tracks[row] for row in rows]
-            for states in self._filters:
-                states.keep_rows(rows)
-
-    def _is_lost(self, track: Track, t_source_ns: int) -> bool:
-        lasting = track.hits >= self.config.confirm_hits or not track.missed
-        patience_s = self.config.forget_s if lasting else self.config.forget_unconfirmed_s
-        return (t_source_ns - track.frame.t_source_ns) * 1e-9 > patience_s
-
-    def _confirmed(self, frame: EgoFrame) -> list[Track]:
-        """The confirmed tracks observed in this frame; a newly confirmed one gets its id."""
-        seen_now = [
-            track
-            for track in self.tracks
-            if track.frame.frame_id == frame.frame_id and track.hits >= self.config.confirm_hits
-        ]
-        for track in seen_now:
-            if track.vehicle < 0 and track.observation.track_id is not None:
-                track.vehicle = track.observation.track_id
-            elif track.vehicle < 0:
-                track.vehicle, self.next_id = self.next_id, self.next_id + 1
-        return sorted(seen_now, key=lambda track: track.vehicle)

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2, wrap
 from birdslam.road_users.association import predict_boxes_px
-from birdslam.road_users.track import EgoFrame, LastEdge, Track, TrackingConfig, in_vehicle_axes
+from birdslam.road_users.track import EgoFrame, LastEdge, TrackingConfig, VehicleTrack, in_vehicle_axes
 from birdslam.types import MotionEdge, VehicleEdge
 
 
 def vehicle_edges(
-    tracks: list[Track], present: EgoFrame, ground: GroundPlane, camera: Camera, config: TrackingConfig
+    tracks: list[VehicleTrack], present: EgoFrame, ground: GroundPlane, camera: Camera, config: TrackingConfig
 ) -> tuple[tuple[VehicleEdge, ...], tuple[MotionEdge, ...]]:
     """CV and VV edges of tracks that were all observed in one frame, the current or an earlier one.
 
@@ -38,14 +38,14 @@ def vehicle_edges(
     return tuple(cv), tuple(vv)
 
 
-def _vehicle_edge(track: Track, delay_ns: int, config: TrackingConfig) -> VehicleEdge:
+def _vehicle_edge(track: VehicleTrack, delay_ns: int, config: TrackingConfig) -> VehicleEdge:
     seen, place = track.observation, track.place
     yaw_rad = wrap(wrap(-track.frame.T_world_ego.yaw_rad) + track.yaw_rad)
     xx, xy, yy = in_vehicle_axes(place.cov, yaw_rad)  # in the tangent space at the vehicle's pose
     least_rad = config.sigma_yaw_moving_rad if track.is_yaw_known else config.sigma_yaw_unknown_rad
     var_yaw = least_rad**2 + track.sigma_yaw_rad**2
     return VehicleEdge(
-        vehicle=track.vehicle,
+        vehicle=track.number,
         frame=track.frame.frame_id,
         T_ego_vehicle=SE2(float(place.centre_m[0]), float(place.centre_m[1]), yaw_rad),
         cov=(xx, xy, 0.0, xy, yy, 0.0, 0.0, 0.0, var_yaw),
@@ -60,8 +60,8 @@ def _vehicle_edge(track: Track, delay_ns: int, config: TrackingConfig) -> Vehicl
 
 
 def _extrapolated(
-    tracks: list[Track], present: EgoFrame, ground: GroundPlane, camera: Camera, config: TrackingConfig
-) -> list[Track | None]:
+    tracks: list[VehicleTrack], present: EgoFrame, ground: GroundPlane, camera: Camera, config: TrackingConfig
+) -> list[VehicleTrack | None]:
     """Extrapolates tracks of one frame to the current one by their velocities.
 
     None if a vehicle left the view or its velocity is too uncertain.
@@ -92,7 +92,7 @@ def _extrapolated(
 
 def _extrapolated_motion(
     motion: MotionEdge,
-    track: Track,
+    track: VehicleTrack,
     frame_id: int,
     step_m: NDArray[np.float64],
     drift: NDArray[np.float64],

@@ -31,7 +31,7 @@ def followed_people(tracker: PeopleTracker, present: EgoFrame) -> tuple[Followed
     child, standing = (np.clip(share, 0.0, 1.0).tolist() for share in (moments.child, moments.standing))
     stands, out = stand.tolist(), []
     for k, track in enumerate(tracks):
-        if track.person < 0:
+        if track.number < 0:
             continue
         height_m = math.exp(log_height[k])
         sizes = tracker.config.people.sizes(track.label)
@@ -39,7 +39,7 @@ def followed_people(tracker: PeopleTracker, present: EgoFrame) -> tuple[Followed
         moves = Moves.STANDING if stands[k] else Moves.DRIVING if track.hits >= MIN_REPORT_FRAMES else Moves.UNDECIDED
         out.append(
             FollowedPerson(
-                person=track.person,
+                person=track.number,
                 x_m=x,
                 y_m=y,
                 cov=_symmetric(cov[k]),
@@ -57,7 +57,7 @@ def followed_people(tracker: PeopleTracker, present: EgoFrame) -> tuple[Followed
                 width_m=sizes.footprint_m,
                 standing=standing[k],
                 moves=moves,
-                age_ns=max(0, present.t_source_ns - track.seen_ns),
+                age_ns=max(0, present.t_source_ns - track.frame.t_source_ns),
                 frames=track.hits,
             )
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import msgspec
 import numpy as np
@@ -14,6 +14,7 @@ from birdslam.geometry.arrays import Floats
 from birdslam.geometry.bev import RoadProfile
 from birdslam.geometry.camera import Camera
 from birdslam.perception import Detections
+from birdslam.road_users.life_cycle import LifeCycle
 from birdslam.road_users.out_of_sequence import OpenFrame
 from birdslam.road_users.people.box_model import MIN_DT_S, MIN_SLOPE, road_tilts
 from birdslam.road_users.people.people_boxes import (
@@ -28,10 +29,9 @@ from birdslam.road_users.people.people_config import PeopleConfig
 from birdslam.road_users.people.people_filter import PeopleFilter
 from birdslam.road_users.placement.localisation import LocalisationConfig, iou
 from birdslam.road_users.state.ground_size_filter import GroundSizeFilter
-from birdslam.road_users.track import TrackingConfig
+from birdslam.road_users.track import Track, TrackingConfig
 from birdslam.types import FIRST_PERSON
 
-IMPOSSIBLE_COST = 1e9
 NEW_PER_S = 1.0  # rate of new people, per unit of bearing, slope and log height
 SIDE_MARGIN = 0.03  # of the image width, beyond which a person has left
 MAX_OUTSIDE_S = 0.3  # until a person outside the image is removed
@@ -58,16 +58,11 @@ class PeopleTrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
     people: PeopleConfig = PeopleConfig()
 
 
-@dataclass
-class PersonTrack:
+@dataclass(kw_only=True)
+class PersonTrack(Track):
     """A tracked person, in the row of the filter with its index."""
 
     box: PersonBox  # last one
-    seen_ns: int
-    seen_frame: int
-    person: int = -1  # persistent id, once confirmed
-    hits: int = 1
-    votes: Counter[str] = field(default_factory=Counter)
     is_stationary: bool = False  # with hysteresis
     outside_s: float = 0.0  # time outside the image, as predicted
 
@@ -98,18 +93,19 @@ class PeopleTracker:
         first_id: int = FIRST_PERSON,
     ) -> None:
         """`tracking` and `localisation` are those of vehicles, for what both have in common."""
-        from scipy.optimize import linear_sum_assignment  # lazy: 9 MB that only the tracking process needs
-
-        self._assign = linear_sum_assignment
         self.camera = camera
         self.config = config
         self.tracking = tracking
         self.localisation = localisation
         self.filter = PeopleFilter(config.people)
-        self.tracks: list[PersonTrack] = []
+        self.life = LifeCycle[PersonTrack](tracking, config.forget_s, (self.filter,), first_id)
         self.frame: OpenFrame | None = None  # last settled frame
         self._pitch_rad: float | None = None
-        self.next_id = first_id
+
+    @property
+    def tracks(self) -> list[PersonTrack]:
+        """The tracked people."""
+        return self.life.tracks
 
     def settle(self, frame: OpenFrame, detections: Detections | None, road: GroundSizeFilter) -> None:
         """Processes the next frame; `detections` is None if no detector processed it, `road` is the ground in it."""
@@ -118,6 +114,7 @@ class PeopleTracker:
         self._predict(frame, road)
         self.frame = frame
         if detections is not None:
+            self.life.count_missed()
             boxes = observe_people(detections, self.camera, ground, self.config.boxes, self.localisation)
             pairs = self._associate(boxes, frame, profile)
             rows = [row for row, _ in pairs]
@@ -125,10 +122,9 @@ class PeopleTracker:
             unseen_s = []
             for row, k in pairs:
                 track = self.tracks[row]
-                unseen_s.append((ego.t_source_ns - track.seen_ns) * 1e-9)
-                track.box, track.seen_ns, track.seen_frame = boxes[k], ego.t_source_ns, ego.frame_id
-                track.hits += 1
-                track.votes[boxes[k].label] += 1
+                unseen_s.append((ego.t_source_ns - track.frame.t_source_ns) * 1e-9)
+                track.box = boxes[k]
+                self.life.observe(track, ego, boxes[k].label)
             born = self._start_tracks(boxes, {k for _, k in pairs}, frame, profile)
             seen, unseen_s = [*(boxes[k] for _, k in pairs), *born], [*unseen_s, *[math.inf] * len(born)]
             road.correct_by_people(road_tilts(seen, unseen_s, profile, self.config.people))
@@ -151,16 +147,11 @@ class PeopleTracker:
         costs += self._shape_costs(boxes, frame.ego.t_source_ns)
         squared, costs = np.where(costs[0] <= costs[1], squared[0], squared[1]), costs.min(axis=0)
         t_ns = frame.ego.t_source_ns
-        since_s = max((t_ns - max(track.seen_ns for track in self.tracks)) * 1e-9, MIN_DT_S)  # anybody had a box
+        since_s = max(
+            (t_ns - max(track.frame.t_source_ns for track in self.tracks)) * 1e-9, MIN_DT_S
+        )  # anybody had a box
         costs += self._detection_costs(since_s) + self._class_costs(boxes)
-        cost = np.where(squared <= self.config.gate, costs, IMPOSSIBLE_COST)
-        new = -2.0 * math.log(NEW_PER_S * since_s)
-        births = np.where(np.eye(len(boxes)), new, IMPOSSIBLE_COST)  # one row per box, for a new person
-        rows, columns = self._assign(np.vstack([cost, births]))
-        known = len(self.tracks)
-        return [
-            (int(i), int(j)) for i, j in zip(rows, columns, strict=True) if i < known and cost[i, j] < IMPOSSIBLE_COST
-        ]  # fmt: skip
+        return self.life.associate(costs, squared <= self.config.gate, -2.0 * math.log(NEW_PER_S * since_s))
 
     def _detection_costs(self, since_s: float) -> Floats:
         """(N, 1) -2 log odds that each person has a box, by a Markov chain.
@@ -169,8 +160,8 @@ class PeopleTracker:
         """
         lost = -math.expm1(-since_s / self.config.seen_for_s)
         found = -math.expm1(-since_s / self.config.hidden_for_s)
-        last = max(track.seen_frame for track in self.tracks)
-        again = np.where([track.seen_frame == last for track in self.tracks], 1.0 - lost, found)
+        last = max(track.frame.frame_id for track in self.tracks)
+        again = np.where([track.frame.frame_id == last for track in self.tracks], 1.0 - lost, found)
         return np.asarray(-2.0 * np.log(again / (1.0 - again)))[:, None]
 
     def _class_costs(self, boxes: Sequence[PersonBox]) -> Floats:
@@ -194,7 +185,7 @@ class PeopleTracker:
             )
             for of in (before, boxes)
         )
-        unseen_s = np.array([(t_ns - track.seen_ns) * 1e-9 for track in self.tracks])[:, None]
+        unseen_s = np.array([(t_ns - track.frame.t_source_ns) * 1e-9 for track in self.tracks])[:, None]
         variance = config.sigma_shape**2 - config.sigma_stride**2 * np.expm1(-unseen_s / config.stride_s)
         off = np.stack([np.subtract.outer(last, now), np.subtract.outer(last_width, now_width)])
         squared = np.square(off) / variance
@@ -207,18 +198,15 @@ class PeopleTracker:
     ) -> list[PersonBox]:
         """Starts tracks of unmatched boxes, and returns these."""
         followed = np.array([boxes[k].box_px for k in matched]).reshape(-1, 4)
-        births: list[PersonBox] = []
-        for k, box in enumerate(boxes):
-            if k in matched or box.label == BICYCLE or box.score < self.tracking.birth_score:
-                continue
-            if len(followed) and iou(np.array([box.box_px]), followed).max() > self.config.birth_iou:
-                continue
-            births.append(box)
+        births = [
+            boxes[k]
+            for k in self.life.births([box.score for box in boxes], matched)
+            if boxes[k].label != BICYCLE
+            and iou(np.array([boxes[k].box_px]), followed).max(initial=0.0) <= self.config.birth_iou
+        ]
         ego = frame.ego
         self.filter.add_people(births, ego.T_world_ego, road)
-        self.tracks += [
-            PersonTrack(box, ego.t_source_ns, ego.frame_id, votes=Counter({box.label: 1})) for box in births
-        ]
+        self.tracks.extend(PersonTrack(frame=ego, box=box, votes=Counter({box.label: 1})) for box in births)
         return births
 
     def _finish_frame(self, frame: OpenFrame) -> None:
@@ -228,23 +216,15 @@ class PeopleTracker:
         ego, moments = frame.ego, self.filter.moments()
         at = (moments.mean[:, :2] - [ego.T_world_ego.x_m, ego.T_world_ego.y_m]) @ ego.T_world_ego.rotation()
         edge = (0.5 + SIDE_MARGIN) * self.camera.width_px / self.camera.fx_px
-        alive = []
-        for row, track in enumerate(self.tracks):
-            x_m, y_m = at[row].tolist()
-            outside = x_m < 1.0 or abs(y_m) > edge * x_m
-            track.outside_s = track.outside_s + frame.dt_s if outside and track.seen_ns != ego.t_source_ns else 0.0
-            lasting = track.hits >= self.tracking.confirm_hits
-            unseen_s = (ego.t_source_ns - track.seen_ns) * 1e-9
-            limit_s = self.config.forget_s if lasting else self.tracking.forget_unconfirmed_s
-            if unseen_s <= limit_s and track.outside_s <= MAX_OUTSIDE_S and math.isfinite(x_m + y_m):
-                alive.append((math.hypot(x_m, y_m), row))
-        rows = sorted(row for _, row in sorted(alive)[: self.config.most])
-        if len(rows) < len(self.tracks):
-            self.filter.keep_rows(rows)
-            self.tracks = [self.tracks[row] for row in rows]
-        for track, standing in zip(self.tracks, moments.standing[rows].tolist(), strict=True):
-            if track.person < 0 and track.hits >= self.tracking.confirm_hits:
-                track.person, self.next_id = self.next_id, self.next_id + 1
+        for (x_m, y_m), standing, track in zip(at.tolist(), moments.standing.tolist(), self.tracks, strict=True):
+            outside = (x_m < 1.0 or abs(y_m) > edge * x_m) and track.frame.t_source_ns != ego.t_source_ns
+            track.outside_s = track.outside_s + frame.dt_s if outside else 0.0
             track.is_stationary = standing > (
                 MIN_STAY_PROBABILITY if track.is_stationary else MIN_STATIONARY_PROBABILITY
             )
+        away_m = np.linalg.norm(at, axis=1)
+        farthest_m = np.sort(away_m)[min(self.config.most, len(away_m)) - 1]
+        gone = (away_m > farthest_m) | ~np.isfinite(away_m)
+        tracks = self.tracks
+        self.life.delete_lost(ego.t_source_ns, lambda row: bool(gone[row]) or tracks[row].outside_s > MAX_OUTSIDE_S)
+        self.life.confirm(ego)

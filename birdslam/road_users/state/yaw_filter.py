@@ -12,7 +12,7 @@ from birdslam.road_users.placement.depth_fusion import DepthPlace
 from birdslam.road_users.placement.localisation import LocalisationConfig, centre_at, extent_m
 from birdslam.road_users.state.ground_size_filter import GroundSizeFilter
 from birdslam.road_users.state.yaw_by_outline import YawByOutline
-from birdslam.road_users.track import Track, TrackingConfig
+from birdslam.road_users.track import TrackingConfig, VehicleTrack
 
 MIN_TURN_RAD = 0.02  # smaller turns are ignored, against jitter
 MOTION_FRONT_LOGIT = 6.0  # log odds of the front of a moving vehicle
@@ -39,7 +39,7 @@ class YawFilter:
             self._ego_speed_mps = math.hypot(step.x_m, step.y_m) / dt_s
         self._dt_s = dt_s
 
-    def correct_by_motion(self, row: int, track: Track) -> None:
+    def correct_by_motion(self, row: int, track: VehicleTrack) -> None:
         """Corrects the yaw by the direction of a significant motion."""
         if track.is_stationary or track.observation.is_cut_at_side:
             return
@@ -56,7 +56,7 @@ class YawFilter:
         track.front_logit = MOTION_FRONT_LOGIT
         self._correct(row, track, turn, (config.direction_inflation * sigma / speed) ** 2)
 
-    def correct_by_body(self, row: int, track: Track, by_depth: DepthPlace | None) -> None:
+    def correct_by_body(self, row: int, track: VehicleTrack, by_depth: DepthPlace | None) -> None:
         """Corrects the yaw by the axis of the body from a network, and the front by accumulated log odds."""
         if by_depth is None or not by_depth.has_front or track.observation.is_cut_at_side:
             return
@@ -70,7 +70,7 @@ class YawFilter:
             track.yaw_rad, track.front_logit = wrap(track.yaw_rad + math.pi), -track.front_logit
         self._correct(row, track, turn, (self.config.body_yaw_inflation * by_depth.sigma_yaw_rad) ** 2)
 
-    def correct_by_outline(self, row: int, track: Track, outline: YawByOutline) -> None:
+    def correct_by_outline(self, row: int, track: VehicleTrack, outline: YawByOutline) -> None:
         """Sets the yaw from the widths of the boxes, until motion or body measure it."""
         if track.is_yaw_known or track.observation.is_cut_at_side:
             return
@@ -79,7 +79,7 @@ class YawFilter:
         if abs(turn) > MIN_TURN_RAD:
             self._turn(row, track, turn)
 
-    def _correct(self, row: int, track: Track, turn: float, variance: float) -> None:
+    def _correct(self, row: int, track: VehicleTrack, turn: float, variance: float) -> None:
         """Kalman update by a measured turn (rad) with its variance."""
         before = track.sigma_yaw_rad**2 + (self.config.sigma_yaw_rate_radps * self._dt_s) ** 2
         gain = before / (before + variance) if track.is_yaw_known else 1.0
@@ -87,7 +87,7 @@ class YawFilter:
         track.is_yaw_known = True
         self._turn(row, track, gain * turn)
 
-    def _turn(self, row: int, track: Track, turn: float) -> None:
+    def _turn(self, row: int, track: VehicleTrack, turn: float) -> None:
         """Turns the vehicle by `turn` (rad), with everything that depends on the yaw.
 
         It turns about its visible edges; the shift of the centre is not a motion.
@@ -105,7 +105,7 @@ class YawFilter:
         track.first_m = track.first_m + shift_world_m
         track.place = msgspec.structs.replace(track.place, centre_m=track.place.centre_m + np.array([x - x0, y - y0]))
 
-    def _has_moved(self, track: Track) -> bool:
+    def _has_moved(self, track: VehicleTrack) -> bool:
         """Whether it has moved significantly from its first place."""
         x, y = track.first_offset_m.tolist()
         dx, dy = (track.state[:2] - track.first_m).tolist()
