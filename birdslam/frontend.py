@@ -24,8 +24,9 @@ from birdslam.odometry.plausibility import PlausibilityConfig, PlausibilityGate
 from birdslam.perception import Perception
 from birdslam.road_users.camera_height import CameraHeightConfig, CameraHeightEstimator
 from birdslam.road_users.out_of_sequence import OpenFrame, OutOfSequenceConfig, OutOfSequenceTracker
+from birdslam.road_users.people.people_config import PeopleConfig
 from birdslam.road_users.people.people_records import followed_people
-from birdslam.road_users.people.people_tracker import PeopleTracker, PeopleTrackingConfig
+from birdslam.road_users.people.people_tracker import PeopleTracker
 from birdslam.road_users.placement.depth_fusion import PseudoLidarConfig
 from birdslam.road_users.placement.localisation import LocalisationConfig
 from birdslam.road_users.placement.pseudolidar import FrustumNetwork
@@ -67,7 +68,7 @@ class FrontEndConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     lanes: LanesConfig = LanesConfig()
     lane_edges: LaneEdgesConfig = LaneEdgesConfig()
     height: CameraHeightConfig = CameraHeightConfig()
-    people: PeopleTrackingConfig = PeopleTrackingConfig()
+    people: PeopleConfig = PeopleConfig()
 
 
 class Pending(Protocol):

@@ -25,10 +25,10 @@ from birdslam.perception import Detections
 from birdslam.queries import nearby
 from birdslam.road_users.out_of_sequence import OpenFrame
 from birdslam.road_users.people.box_model import road_tilts
-from birdslam.road_users.people.people_boxes import PeopleBoxesConfig, observe_people
+from birdslam.road_users.people.people_boxes import observe_people
 from birdslam.road_users.people.people_config import PeopleConfig
 from birdslam.road_users.people.people_records import followed_people
-from birdslam.road_users.people.people_tracker import PeopleTracker, PeopleTrackingConfig
+from birdslam.road_users.people.people_tracker import PeopleTracker
 from birdslam.road_users.placed_boxes import place_boxes
 from birdslam.road_users.placement.localisation import LocalisationConfig
 from birdslam.road_users.state.ground_size_config import GroundSizeConfig
@@ -47,7 +47,7 @@ from birdslam.types import (
 )
 from tests.recordings import KITTI as CAMERA
 
-BOXES = PeopleBoxesConfig(), LocalisationConfig()
+BOXES = (LocalisationConfig(),)
 Box = tuple[float, float, float, float]
 HZ = 10.0
 
@@ -77,7 +77,7 @@ class Scene:
     """A tracker, and the ego that drives along x."""
 
     def __init__(self, ego_mps: float = 0.0) -> None:
-        self.tracker = PeopleTracker(CAMERA, PeopleTrackingConfig(), TrackingConfig(), LocalisationConfig())
+        self.tracker = PeopleTracker(CAMERA, PeopleConfig(), TrackingConfig(), LocalisationConfig())
         self.road = GroundSizeFilter(CAMERA, GroundSizeConfig())
         self.ego_mps, self.k = ego_mps, 0
 

@@ -19,7 +19,16 @@ from birdslam.geometry.arrays import Floats
 from birdslam.geometry.bev import RoadProfile
 from birdslam.geometry.se2 import SE2
 from birdslam.road_users.people.people_boxes import PersonBox
-from birdslam.road_users.people.people_config import PeopleConfig
+from birdslam.road_users.people.people_config import (
+    HIDDEN_SHARE,
+    OUTLINE_MEMORY_S,
+    SIGMA_HIDDEN_SHARE,
+    SIGMA_KERB_M,
+    SIGMA_OUTLINE_REL,
+    SIGMA_ROLL_RAD,
+    SIGMA_TILT_RAD,
+    PeopleConfig,
+)
 from birdslam.road_users.people.people_state import FOOT, HEAD, HEIGHT, OFFSET, STATES, TILT
 from birdslam.road_users.state.ground_measurements import RoadTilts
 
@@ -47,7 +56,7 @@ def measured_boxes(boxes: Sequence[PersonBox]) -> tuple[Floats, Floats]:
 
 
 def expected_boxes(
-    x: Floats, T_world_ego: SE2, road: RoadProfile, reach_m: Floats, log_width: Floats, config: PeopleConfig
+    x: Floats, T_world_ego: SE2, road: RoadProfile, reach_m: Floats, log_width: Floats
 ) -> tuple[Floats, Floats]:
     """Expected measurements (M, K, 2, 4) of states (M, K, 2, S), with visible and hidden feet, and Jacobians.
 
@@ -71,8 +80,8 @@ def expected_boxes(
     J[..., BEARING, :2] += R[:, 1] / depth[..., None]
     J[..., BOTTOM, TILT], J[..., BOTTOM, OFFSET], J[..., BOTTOM, FOOT] = -1.0, 1.0 / foot, tall
     J[..., TALL, HEIGHT], J[..., TALL, FOOT], J[..., TALL, HEAD] = 1.0, 1.0, -1.0
-    expected[:, :, 1, BOTTOM] -= config.hidden_share * tall[:, :, 1]
-    expected[:, :, 1, TALL] += math.log(1.0 - config.hidden_share)
+    expected[:, :, 1, BOTTOM] -= HIDDEN_SHARE * tall[:, :, 1]
+    expected[:, :, 1, TALL] += math.log(1.0 - HIDDEN_SHARE)
     return expected, J
 
 
@@ -94,16 +103,16 @@ def road_tilts(
         bottom = box.slope_bottom - sizes.foot_rel * tall
         tilt = road.slope(max(depth - sizes.reach_m, MIN_DISTANCE_M)) - bottom
         slope = road.height_m / depth
-        of_size = sizes.sigma_height_rel**2 + (2.0 * config.sigma_outline_rel) ** 2
-        variance = slope**2 * of_size + (config.sigma_kerb_m / depth) ** 2
-        variance += config.sigma_tilt_rad**2 + (config.sigma_roll_rad * box.bearing) ** 2
-        rows.append((tilt, box.bearing, slope, variance, max(1.0, config.outline_memory_s / max(since_s, MIN_DT_S))))
+        of_size = sizes.sigma_height_rel**2 + (2.0 * SIGMA_OUTLINE_REL) ** 2
+        variance = slope**2 * of_size + (SIGMA_KERB_M / depth) ** 2
+        variance += SIGMA_TILT_RAD**2 + (SIGMA_ROLL_RAD * box.bearing) ** 2
+        rows.append((tilt, box.bearing, slope, variance, max(1.0, OUTLINE_MEMORY_S / max(since_s, MIN_DT_S))))
     return RoadTilts(*np.array(rows).reshape(-1, 5).T)
 
 
-def hide_feet(noise: Floats, tall: Floats, config: PeopleConfig) -> None:
+def hide_feet(noise: Floats, tall: Floats) -> None:
     """Adds the noise of hidden feet to covariances (..., 4, 4) in place; `tall` (...) is the height at a depth of 1."""
-    of_bottom, of_height = config.sigma_hidden_share * tall, config.sigma_hidden_share / (1.0 - config.hidden_share)
+    of_bottom, of_height = SIGMA_HIDDEN_SHARE * tall, SIGMA_HIDDEN_SHARE / (1.0 - HIDDEN_SHARE)
     noise[..., BOTTOM, BOTTOM] += of_bottom**2
     noise[..., BOTTOM, TALL] += of_bottom * of_height
     noise[..., TALL, BOTTOM] += of_bottom * of_height

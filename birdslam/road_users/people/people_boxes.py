@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import msgspec
 import numpy as np
 
 from birdslam.geometry import bev
@@ -29,19 +28,15 @@ MIN_RIDER_INSIDE_RATIO, MIN_RIDER_IOU = 0.8, 0.5  # of a rider's box inside the 
 MIN_OCCUPANT_INSIDE_RATIO = 0.9  # of an occupant's box inside the vehicle's
 MIN_DUPLICATE_IOU = 0.7  # of two boxes of one person
 MIN_COVER_RATIO = 0.3  # covered fraction of the lower edge that hides the feet
-
-
-class PeopleBoxesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Noise of boxes of people; fractions are of the height of the box."""
-
-    sigma_edge_rel: float = 0.03  # 1-sigma of lower and upper edge
-    sigma_edge_px: float = 0.5  # and a constant part
-    sigma_covered_rel: float = 0.06  # additional, of a covered lower edge
-    sigma_side_rel: float = 0.035  # of the middle column: swinging limbs
-    sure_score: float = 0.85  # score above which the noise is not increased
-    hidden: float = 0.003  # prior probability of hidden feet without a covering box
-    hidden_covered: float = 0.03  # with a covering box
-    hidden_cut: float = 0.8  # at the image border
+# Noise of boxes of people; fractions are of the height of the box
+SIGMA_EDGE_REL = 0.03  # 1-sigma of lower and upper edge
+SIGMA_EDGE_PX = 0.5  # and a constant part
+SIGMA_COVERED_REL = 0.06  # additional, of a covered lower edge
+SIGMA_SIDE_REL = 0.035  # of the middle column: swinging limbs
+SURE_SCORE = 0.85  # score above which the noise is not increased
+HIDDEN_PROBABILITY = 0.003  # prior probability of hidden feet without a covering box
+HIDDEN_COVERED_PROBABILITY = 0.03  # with a covering box
+HIDDEN_CUT_PROBABILITY = 0.8  # at the image border
 
 
 @dataclass(frozen=True)
@@ -76,7 +71,6 @@ def observe_people(
     detections: Detections,
     camera: Camera,
     ground: GroundPlane,
-    config: PeopleBoxesConfig,
     localisation: LocalisationConfig,
 ) -> list[PersonBox]:
     """The people among the boxes of a frame, best score first: riders once, without occupants of cars.
@@ -103,7 +97,6 @@ def observe_people(
             slopes[i],
             sigma,
             camera,
-            config,
             localisation,
         )
         for i in order.tolist()
@@ -236,23 +229,22 @@ def _observe(
     rays: Floats,
     stated: EdgeSigma | None,
     camera: Camera,
-    config: PeopleBoxesConfig,
     localisation: LocalisationConfig,
 ) -> PersonBox:
     x1, y1, x2, y2 = box.tolist()
     width_px, height_px = x2 - x1, y2 - y1
-    factor = 1.0 + localisation.sigma_growth * max(0.0, config.sure_score - score)
-    rel = (config.sigma_edge_rel,) * 2 if stated is None else stated.rel[2:]
-    px = config.sigma_edge_px if stated is None else stated.px
-    upper, lower = (factor * math.hypot(height_px * max(r, config.sigma_edge_rel), px) / camera.fy_px for r in rel)
+    factor = 1.0 + localisation.sigma_growth * max(0.0, SURE_SCORE - score)
+    rel = (SIGMA_EDGE_REL,) * 2 if stated is None else stated.rel[2:]
+    px = SIGMA_EDGE_PX if stated is None else stated.px
+    upper, lower = (factor * math.hypot(height_px * max(r, SIGMA_EDGE_REL), px) / camera.fy_px for r in rel)
     if covered:
-        lower = math.hypot(lower, height_px * config.sigma_covered_rel / camera.fy_px)
+        lower = math.hypot(lower, height_px * SIGMA_COVERED_REL / camera.fy_px)
     cut_px = localisation.cut_margin_px
     margin_px = cut_px + 0.02 * height_px
     cut_bottom = y2 > camera.height_px - margin_px
     cut_top = y1 < cut_px
     is_cut_at_side = x1 < cut_px or x2 > camera.width_px - cut_px
-    across = factor * math.hypot(height_px * config.sigma_side_rel, px) / camera.fx_px
+    across = factor * math.hypot(height_px * SIGMA_SIDE_REL, px) / camera.fx_px
     if is_cut_at_side:
         across = math.hypot(across, 0.5 * width_px / camera.fx_px)
     return PersonBox(
@@ -266,7 +258,7 @@ def _observe(
         slope_top=float(rays[2]),
         sigma_top=math.hypot(upper, 0.5 * height_px / camera.fy_px) if cut_top or not is_complete else upper,
         log_width=math.log(max(width_px, 1.0) / camera.fx_px),
-        hidden=config.hidden_cut if cut_bottom else config.hidden_covered if covered else config.hidden,
+        hidden=HIDDEN_CUT_PROBABILITY if cut_bottom else HIDDEN_COVERED_PROBABILITY if covered else HIDDEN_PROBABILITY,
         is_complete=is_complete,
         rows=rows,
     )

@@ -6,6 +6,23 @@ import msgspec
 
 from birdslam.road_users.people.people_boxes import PEDESTRIAN
 
+STANDING_RATIO = 0.2  # initial probability of standing
+STANDS_FOR_S = 10.0  # mean duration
+MOVES_FOR_S = 10.0  # mean duration
+CROSSING_RATIO = 0.3  # fraction of moving people in any direction
+TURNS_AFTER_S = 10.0  # mean time between changes of direction
+STOP_MPS = 0.08  # 1-sigma of the velocity of a standing person
+SIGMA_TILT_RAD = 0.009  # of the road at a person relative to the ego, beyond the front end's sigma
+TILT_DRIFT_RAD = 0.003  # and its change within a second as people walk
+SIGMA_ROLL_RAD = 0.01  # of the front end's roll, per unit of y/x
+SIGMA_KERB_M = 0.1  # 1-sigma of the ground offset under a person
+HIDDEN_SHARE = 0.3  # mean hidden fraction of the height with hidden feet
+SIGMA_HIDDEN_SHARE = 0.35  # 1-sigma of it
+BOX_MEMORY_S = 0.4  # correlation time of the errors of a box
+WIDTH_MEMORY_S = 5.0  # correlation time of its width
+OUTLINE_MEMORY_S = 2.0  # correlation time of its systematic vertical errors
+SIGMA_OUTLINE_REL = 0.06  # 1-sigma of them, of the height
+
 
 class Sizes(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Dimensions and motion of a class of people."""
@@ -30,7 +47,7 @@ class Sizes(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class PeopleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Priors of people and of the road under them, and correlation of the errors of boxes."""
+    """Priors of each class."""
 
     pedestrian: Sizes = Sizes(
         height_m=1.72,
@@ -68,22 +85,6 @@ class PeopleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         crossing_mps=4.0,
         change_mps=1.2,
     )
-    standing: float = 0.2  # initial probability of standing
-    stands_for_s: float = 10.0  # mean duration
-    moves_for_s: float = 10.0  # mean duration
-    crossing: float = 0.3  # fraction of moving people in any direction
-    turns_after_s: float = 10.0  # mean time between changes of direction
-    stop_mps: float = 0.08  # 1-sigma of the velocity of a standing person
-    sigma_tilt_rad: float = 0.009  # of the road at a person relative to the ego, beyond the front end's sigma
-    tilt_drift_rad: float = 0.003  # and its change within a second as people walk
-    sigma_roll_rad: float = 0.01  # of the front end's roll, per unit of y/x
-    sigma_kerb_m: float = 0.1  # 1-sigma of the ground offset under a person
-    hidden_share: float = 0.3  # mean hidden fraction of the height with hidden feet
-    sigma_hidden_share: float = 0.35  # 1-sigma of it
-    box_memory_s: float = 0.4  # correlation time of the errors of a box
-    width_memory_s: float = 5.0  # correlation time of its width
-    outline_memory_s: float = 2.0  # correlation time of its systematic vertical errors
-    sigma_outline_rel: float = 0.06  # 1-sigma of them, of the height
 
     def sizes(self, label: str) -> Sizes:
         """The parameters of a label."""

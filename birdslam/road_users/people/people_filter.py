@@ -27,7 +27,18 @@ from birdslam.road_users.people.box_model import (
     measured_boxes,
 )
 from birdslam.road_users.people.people_boxes import PersonBox
-from birdslam.road_users.people.people_config import PeopleConfig
+from birdslam.road_users.people.people_config import (
+    BOX_MEMORY_S,
+    HIDDEN_SHARE,
+    OUTLINE_MEMORY_S,
+    SIGMA_KERB_M,
+    SIGMA_OUTLINE_REL,
+    SIGMA_ROLL_RAD,
+    SIGMA_TILT_RAD,
+    TILT_DRIFT_RAD,
+    WIDTH_MEMORY_S,
+    PeopleConfig,
+)
 from birdslam.road_users.people.people_motion import (
     initial_velocities,
     mix_motions,
@@ -104,29 +115,29 @@ class PeopleFilter:
         `ego_cov` (3, 3) is the covariance of the ego's step in its tangent space, `driving` the driving fraction of a
         second, `keep_tilt` the correlation of the road's tilt at a person with that of the last frame.
         """
-        config, n, keep = self.config, len(self._x), keep_tilt
+        n, keep = len(self._x), keep_tilt
         self._driving = driving
         self._common[0, 0] -= ground_shift_rad
         if not n or dt_s <= 0.0:
             return
         self._unseen_s += dt_s
         self._x, self._P, self._weight = mix_motions(
-            self._x, self._P, self._weight, self._moves, dt_s, T_world_ego.yaw_rad, config
+            self._x, self._P, self._weight, self._moves, dt_s, T_world_ego.yaw_rad
         )
         self._x, self._P = predict_motion(self._x, self._P, self._sizes[:, 1], dt_s)
         mean, var = self._common[0]
         self._x[..., TILT] = mean + keep * (self._x[..., TILT] - ground_shift_rad - mean)
         self._P[..., TILT, :] *= keep
         self._P[..., TILT] *= keep
-        self._P[..., TILT, TILT] += (1.0 - keep**2) * (var + config.sigma_tilt_rad**2)
-        self._P[..., TILT, TILT] += config.tilt_drift_rad**2 * dt_s
-        keep = math.exp(-dt_s / config.outline_memory_s)
+        self._P[..., TILT, TILT] += (1.0 - keep**2) * (var + SIGMA_TILT_RAD**2)
+        self._P[..., TILT, TILT] += TILT_DRIFT_RAD**2 * dt_s
+        keep = math.exp(-dt_s / OUTLINE_MEMORY_S)
         for k, state in enumerate((FOOT, HEAD)):
             mean = self._sizes[:, 4 + k, None]
             self._x[..., state] = mean + keep * (self._x[..., state] - mean)
             self._P[..., state, :] *= keep
             self._P[..., state] *= keep
-            self._P[..., state, state] += (1.0 - keep**2) * config.sigma_outline_rel**2
+            self._P[..., state, state] += (1.0 - keep**2) * SIGMA_OUTLINE_REL**2
         if ego_cov is not None:  # an error of the ego step moves all people in ego
             from_ego = self._x[..., :2] - [T_world_ego.x_m, T_world_ego.y_m]
             J = np.zeros((n, FILTERS, 2, 3))
@@ -138,15 +149,15 @@ class PeopleFilter:
         """Adds new people in rows after the others, and corrects them by their boxes."""
         if not boxes:
             return
-        config, n, before = self.config, len(boxes), len(self._x)
+        n, before = len(boxes), len(self._x)
         x, P = np.zeros((n, FILTERS, len(STATES))), np.zeros((n, FILTERS, len(STATES), len(STATES)))
         weight, rows = np.zeros((n, FILTERS)), np.zeros((n, 6))
         log_height = np.zeros((n, FILTERS))
         moves, own_var = np.zeros((n, len(MOTIONS), 3)), np.zeros((2, n, FILTERS))
         for k, box in enumerate(boxes):
-            sizes = config.sizes(box.label)
-            moves[k] = motion_parameters(sizes, config)
-            own_var[0, k] = config.sigma_tilt_rad**2 + (config.sigma_roll_rad * box.bearing) ** 2
+            sizes = self.config.sizes(box.label)
+            moves[k] = motion_parameters(sizes)
+            own_var[0, k] = SIGMA_TILT_RAD**2 + (SIGMA_ROLL_RAD * box.bearing) ** 2
             rows[k] = [
                 sizes.reach_m, sizes.change_mps, math.log(sizes.width_m), sizes.sigma_width_rel,
                 sizes.foot_rel, -sizes.head_rel,
@@ -161,12 +172,12 @@ class PeopleFilter:
                 x[k, both, HEIGHT] = math.log(h_m) + self._common[1, 0]
                 P[k, both, :2, :2] = np.eye(2) * (INITIAL_DEPTH_SIGMA_REL * x_m) ** 2
                 own_var[1, k, both] = sigma**2
-                weight[k, both] = (sizes.child if child else 1.0 - sizes.child) * motion_priors(config)
+                weight[k, both] = (sizes.child if child else 1.0 - sizes.child) * motion_priors()
             x[k, :, FOOT], x[k, :, HEAD] = sizes.foot_rel, -sizes.head_rel
             x[k, :, TILT] = self._common[0, 0]
             P[k, :, [TILT, HEIGHT], [TILT, HEIGHT]] = self._common[:, 1, None] + own_var[:, k]
-            P[k, :, [FOOT, HEAD], [FOOT, HEAD]] = config.sigma_outline_rel**2
-            P[k, :, OFFSET, OFFSET] = config.sigma_kerb_m**2
+            P[k, :, [FOOT, HEAD], [FOOT, HEAD]] = SIGMA_OUTLINE_REL**2
+            P[k, :, OFFSET, OFFSET] = SIGMA_KERB_M**2
         self._moves = np.concatenate([self._moves, moves])
         mean, cov = initial_velocities(self._moves, T_world_ego.yaw_rad)
         x[..., VELOCITY] = np.tile(mean[before:], (1, 2, 1))
@@ -176,7 +187,7 @@ class PeopleFilter:
         self._sizes = np.concatenate([self._sizes, rows])
         self._log_height = np.concatenate([self._log_height, log_height])
         self._own_var = np.concatenate([self._own_var, own_var], axis=1)
-        self._unseen_s = np.concatenate([self._unseen_s, np.full(n, max(config.box_memory_s, config.width_memory_s))])
+        self._unseen_s = np.concatenate([self._unseen_s, np.full(n, max(BOX_MEMORY_S, WIDTH_MEMORY_S))])
         self.correct(range(before, before + n), boxes, T_world_ego, road, BIRTH_ITERATIONS)
 
     def correct(
@@ -192,16 +203,16 @@ class PeopleFilter:
             return
         at = np.asarray(rows)
         z, R = self._measured(at, boxes)  # (M, 4), (M, 4, 4)
-        counts = np.minimum(1.0, self._unseen_s[at] / self.config.box_memory_s)[
+        counts = np.minimum(1.0, self._unseen_s[at] / BOX_MEMORY_S)[
             :, None, None
         ]  # effective number of independent boxes
         hidden = np.array([box.hidden for box in boxes])
         x0, P0 = self._x[at][:, :, None], self._P[at][:, :, None]  # (M, K, 1, 9)
         x = np.repeat(x0, 2, axis=2)
         for _ in range(iterations):
-            expected, J = expected_boxes(x, T_world_ego, road, self._sizes[at, 0], self._sizes[at, 2], self.config)
+            expected, J = expected_boxes(x, T_world_ego, road, self._sizes[at, 0], self._sizes[at, 2])
             noise = np.broadcast_to(R[:, None, None], (*x.shape[:3], 4, 4)).copy()
-            hide_feet(noise[:, :, 1], np.exp(expected[:, :, 0, TALL]), self.config)
+            hide_feet(noise[:, :, 1], np.exp(expected[:, :, 0, TALL]))
             PJt = P0 @ J.swapaxes(-1, -2)
             of_one_box = J @ PJt + noise
             S = J @ PJt + noise / counts[..., None, None]
@@ -227,7 +238,7 @@ class PeopleFilter:
     def _measured(self, at: NDArray[np.intp], boxes: Sequence[PersonBox]) -> tuple[Floats, Floats]:
         """Measurements (M, 4) of the boxes, and their covariances (M, 4, 4)."""
         z, R = measured_boxes(boxes)
-        uses = np.array([b.is_complete for b in boxes]) & (self._unseen_s[at] >= self.config.width_memory_s)
+        uses = np.array([b.is_complete for b in boxes]) & (self._unseen_s[at] >= WIDTH_MEMORY_S)
         R[:, WIDTH, WIDTH] = np.where(uses, self._sizes[at, 3], UNUSED_SIGMA) ** 2
         return z, R
 
@@ -279,7 +290,7 @@ class PeopleFilter:
         The first are with visible feet, the second with hidden feet.
         """
         x = np.repeat(self._x[:, :, None], 2, axis=2)
-        expected, J = expected_boxes(x, T_world_ego, road, self._sizes[:, 0], self._sizes[:, 2], self.config)
+        expected, J = expected_boxes(x, T_world_ego, road, self._sizes[:, 0], self._sizes[:, 2])
         expected, J = expected[..., :WIDTH], J[..., :WIDTH, :]
         S = J @ self._P[:, :, None] @ J.swapaxes(-1, -2)
         mean, S = merge_mixture(
@@ -287,7 +298,7 @@ class PeopleFilter:
         )  # (N, 2, 3), (N, 2, 3, 3)
         z, R = measured_boxes(boxes)
         noise = np.stack([R, R])
-        hide_feet(noise[1], np.exp(z[:, TALL]) / (1.0 - self.config.hidden_share), self.config)
+        hide_feet(noise[1], np.exp(z[:, TALL]) / (1.0 - HIDDEN_SHARE))
         hidden = np.array([b.hidden for b in boxes])
         squared, costs = np.empty((2, 2, len(self._x), len(boxes)))
         for k, prior in enumerate((1.0 - hidden, hidden)):

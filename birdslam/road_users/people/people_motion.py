@@ -10,7 +10,15 @@ import math
 import numpy as np
 
 from birdslam.geometry.arrays import Floats
-from birdslam.road_users.people.people_config import PeopleConfig, Sizes
+from birdslam.road_users.people.people_config import (
+    CROSSING_RATIO,
+    MOVES_FOR_S,
+    STANDING_RATIO,
+    STANDS_FOR_S,
+    STOP_MPS,
+    TURNS_AFTER_S,
+    Sizes,
+)
 from birdslam.road_users.people.people_state import (
     FILTERS,
     MOTIONS,
@@ -26,17 +34,17 @@ from birdslam.road_users.people.people_state import (
 )
 
 
-def motion_priors(config: PeopleConfig) -> Floats:
+def motion_priors() -> Floats:
     """(4,) probabilities of the motions at the first observation."""
-    along = (1.0 - config.standing) * (1.0 - config.crossing) / 2.0
-    return np.array([config.standing, along, along, (1.0 - config.standing) * config.crossing])
+    along = (1.0 - STANDING_RATIO) * (1.0 - CROSSING_RATIO) / 2.0
+    return np.array([STANDING_RATIO, along, along, (1.0 - STANDING_RATIO) * CROSSING_RATIO])
 
 
-def motion_parameters(sizes: Sizes, config: PeopleConfig) -> Floats:
+def motion_parameters(sizes: Sizes) -> Floats:
     """(4, 3) of each motion: speed along the road (m/s), its 1-sigma, and 1-sigma across the road."""
     return np.array(
         [
-            (0.0, config.stop_mps, config.stop_mps),
+            (0.0, STOP_MPS, STOP_MPS),
             (-sizes.along_mps, sizes.sigma_along_mps, sizes.sigma_beside_mps),
             (sizes.along_mps, sizes.sigma_along_mps, sizes.sigma_beside_mps),
             (0.0, sizes.crossing_mps, sizes.crossing_mps),
@@ -55,17 +63,15 @@ def initial_velocities(motions: Floats, road_rad: float) -> tuple[Floats, Floats
 
 
 def mix_motions(
-    x: Floats, P: Floats, weight: Floats, motions: Floats, dt_s: float, road_rad: float, config: PeopleConfig
+    x: Floats, P: Floats, weight: Floats, motions: Floats, dt_s: float, road_rad: float
 ) -> tuple[Floats, Floats, Floats]:
     """States (N, 8, S), covariances and weights after changes of motion (mixing step of an IMM).
 
     A starting or stopping person gets the initial velocity of the new motion.
     """
     n, m = len(x), len(MOTIONS)
-    start, stop, turn = (
-        -math.expm1(-dt_s / s) for s in (config.stands_for_s, config.moves_for_s, config.turns_after_s)
-    )
-    share = motion_priors(config)[1:] / (1.0 - config.standing)
+    start, stop, turn = (-math.expm1(-dt_s / s) for s in (STANDS_FOR_S, MOVES_FOR_S, TURNS_AFTER_S))
+    share = motion_priors()[1:] / (1.0 - STANDING_RATIO)
     change = np.zeros((m, m))  # from, to
     change[STATIONARY, 1:] = start * share
     change[1:, STATIONARY] = stop

@@ -34,7 +34,7 @@ def followed_people(tracker: PeopleTracker, present: EgoFrame) -> tuple[Followed
         if track.number < 0:
             continue
         height_m = math.exp(log_height[k])
-        sizes = tracker.config.people.sizes(track.label)
+        sizes = tracker.config.sizes(track.label)
         (x, y), (vx, vy) = at[k], velocity[k]
         moves = Moves.STANDING if stands[k] else Moves.DRIVING if track.hits >= MIN_REPORT_FRAMES else Moves.UNDECIDED
         out.append(

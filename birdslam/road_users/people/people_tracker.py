@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import msgspec
 import numpy as np
 
 from birdslam.geometry.arrays import Floats
@@ -21,7 +20,6 @@ from birdslam.road_users.people.people_boxes import (
     BICYCLE,
     CYCLIST,
     PEDESTRIAN,
-    PeopleBoxesConfig,
     PersonBox,
     observe_people,
 )
@@ -39,23 +37,16 @@ MAX_OUTSIDE_S = 0.3  # until a person outside the image is removed
 SHAPE_DOF = 3.0  # of Student's t
 
 MIN_STATIONARY_PROBABILITY, MIN_STAY_PROBABILITY = 0.7, 0.4  # hysteresis of standing
-
-
-class PeopleTrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Parameters of association and of tracks."""
-
-    gate: float = 16.3  # squared Mahalanobis distance of bearing, bottom and top: 99.9 % of three
-    birth_iou: float = 0.55  # maximum overlap with a tracked box to start a track
-    forget_s: float = 1.5  # without a box, with an id
-    seen_for_s: float = 1.1  # mean time until a person has no box
-    hidden_for_s: float = 0.65  # mean time until the box returns
-    sigma_shape: float = 0.07  # of the log aspect of a box, between two boxes
-    sigma_stride: float = 0.14  # and due to swinging limbs
-    stride_s: float = 1.0  # time constant of that
-    sigma_shapes: float = 0.17  # of the log aspect among people
-    most: int = 60  # maximum number of tracks: the nearest
-    boxes: PeopleBoxesConfig = PeopleBoxesConfig()
-    people: PeopleConfig = PeopleConfig()
+MAX_SQUARED_SIGMAS = 16.3  # squared Mahalanobis distance of bearing, bottom and top: 99.9 % of three
+BIRTH_IOU = 0.55  # maximum overlap with a tracked box to start a track
+FORGET_S = 1.5  # without a box, with an id
+SEEN_FOR_S = 1.1  # mean time until a person has no box
+HIDDEN_FOR_S = 0.65  # mean time until the box returns
+SIGMA_SHAPE = 0.07  # of the log aspect of a box, between two boxes
+SIGMA_STRIDE = 0.14  # and due to swinging limbs
+STRIDE_S = 1.0  # time constant of that
+SIGMA_SHAPES = 0.17  # of the log aspect among people
+MAX_TRACKS = 60  # maximum number of tracks: the nearest
 
 
 @dataclass(kw_only=True)
@@ -87,7 +78,7 @@ class PeopleTracker:
     def __init__(
         self,
         camera: Camera,
-        config: PeopleTrackingConfig,
+        config: PeopleConfig,
         tracking: TrackingConfig,
         localisation: LocalisationConfig,
         first_id: int = FIRST_PERSON,
@@ -97,8 +88,8 @@ class PeopleTracker:
         self.config = config
         self.tracking = tracking
         self.localisation = localisation
-        self.filter = PeopleFilter(config.people)
-        self.life = LifeCycle[PersonTrack](tracking, config.forget_s, (self.filter,), first_id)
+        self.filter = PeopleFilter(config)
+        self.life = LifeCycle[PersonTrack](tracking, FORGET_S, (self.filter,), first_id)
         self.frame: OpenFrame | None = None  # last settled frame
         self._pitch_rad: float | None = None
 
@@ -115,7 +106,7 @@ class PeopleTracker:
         self.frame = frame
         if detections is not None:
             self.life.count_missed()
-            boxes = observe_people(detections, self.camera, ground, self.config.boxes, self.localisation)
+            boxes = observe_people(detections, self.camera, ground, self.localisation)
             pairs = self._associate(boxes, frame, profile)
             rows = [row for row, _ in pairs]
             self.filter.correct(rows, [boxes[k] for _, k in pairs], ego.T_world_ego, profile)
@@ -127,7 +118,7 @@ class PeopleTracker:
                 self.life.observe(track, ego, boxes[k].label)
             born = self._start_tracks(boxes, {k for _, k in pairs}, frame, profile)
             seen, unseen_s = [*(boxes[k] for _, k in pairs), *born], [*unseen_s, *[math.inf] * len(born)]
-            road.correct_by_people(road_tilts(seen, unseen_s, profile, self.config.people))
+            road.correct_by_people(road_tilts(seen, unseen_s, profile, self.config))
             self.filter.set_common_priors(np.array([(0.0, road.sigma_pitch_rad**2), road.bodies]))
         self._finish_frame(frame)
 
@@ -151,15 +142,15 @@ class PeopleTracker:
             (t_ns - max(track.frame.t_source_ns for track in self.tracks)) * 1e-9, MIN_DT_S
         )  # anybody had a box
         costs += self._detection_costs(since_s) + self._class_costs(boxes)
-        return self.life.associate(costs, squared <= self.config.gate, -2.0 * math.log(NEW_PER_S * since_s))
+        return self.life.associate(costs, squared <= MAX_SQUARED_SIGMAS, -2.0 * math.log(NEW_PER_S * since_s))
 
     def _detection_costs(self, since_s: float) -> Floats:
         """(N, 1) -2 log odds that each person has a box, by a Markov chain.
 
         So an occluded person does not take the box of the person in front.
         """
-        lost = -math.expm1(-since_s / self.config.seen_for_s)
-        found = -math.expm1(-since_s / self.config.hidden_for_s)
+        lost = -math.expm1(-since_s / SEEN_FOR_S)
+        found = -math.expm1(-since_s / HIDDEN_FOR_S)
         last = max(track.frame.frame_id for track in self.tracks)
         again = np.where([track.frame.frame_id == last for track in self.tracks], 1.0 - lost, found)
         return np.asarray(-2.0 * np.log(again / (1.0 - again)))[:, None]
@@ -177,7 +168,7 @@ class PeopleTracker:
         With visible feet (first) the aspect stays, with hidden feet (second) the width, while the height shrinks.
         Student's t, since limbs swing and are occluded.
         """
-        config, before = self.config, [track.box for track in self.tracks]
+        before = [track.box for track in self.tracks]
         (last_width, last), (now_width, now) = (
             (
                 np.array([box.log_width for box in of]),
@@ -186,10 +177,10 @@ class PeopleTracker:
             for of in (before, boxes)
         )
         unseen_s = np.array([(t_ns - track.frame.t_source_ns) * 1e-9 for track in self.tracks])[:, None]
-        variance = config.sigma_shape**2 - config.sigma_stride**2 * np.expm1(-unseen_s / config.stride_s)
+        variance = SIGMA_SHAPE**2 - SIGMA_STRIDE**2 * np.expm1(-unseen_s / STRIDE_S)
         off = np.stack([np.subtract.outer(last, now), np.subtract.outer(last_width, now_width)])
         squared = np.square(off) / variance
-        cost = (SHAPE_DOF + 1.0) * np.log1p(squared / SHAPE_DOF) + np.log(variance / config.sigma_shapes**2)
+        cost = (SHAPE_DOF + 1.0) * np.log1p(squared / SHAPE_DOF) + np.log(variance / SIGMA_SHAPES**2)
         same = np.equal.outer([box.label for box in before], [box.label for box in boxes])
         return np.where(same, cost, 0.0)
 
@@ -201,8 +192,7 @@ class PeopleTracker:
         births = [
             boxes[k]
             for k in self.life.births([box.score for box in boxes], matched)
-            if boxes[k].label != BICYCLE
-            and iou(np.array([boxes[k].box_px]), followed).max(initial=0.0) <= self.config.birth_iou
+            if boxes[k].label != BICYCLE and iou(np.array([boxes[k].box_px]), followed).max(initial=0.0) <= BIRTH_IOU
         ]
         ego = frame.ego
         self.filter.add_people(births, ego.T_world_ego, road)
@@ -223,7 +213,7 @@ class PeopleTracker:
                 MIN_STAY_PROBABILITY if track.is_stationary else MIN_STATIONARY_PROBABILITY
             )
         away_m = np.linalg.norm(at, axis=1)
-        farthest_m = np.sort(away_m)[min(self.config.most, len(away_m)) - 1]
+        farthest_m = np.sort(away_m)[min(MAX_TRACKS, len(away_m)) - 1]
         gone = (away_m > farthest_m) | ~np.isfinite(away_m)
         tracks = self.tracks
         self.life.delete_lost(ego.t_source_ns, lambda row: bool(gone[row]) or tracks[row].outside_s > MAX_OUTSIDE_S)
