@@ -18,14 +18,13 @@ import numpy as np
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.bev import RoadProfile
 from birdslam.geometry.se2 import SE2
-from birdslam.road_users.people.people_boxes import PersonBox
+from birdslam.road_users.people.people_boxes import HIDDEN_CUT_PROBABILITY, PersonBox
 from birdslam.road_users.people.people_config import (
     HIDDEN_SHARE,
     OUTLINE_MEMORY_S,
     SIGMA_HIDDEN_SHARE,
     SIGMA_KERB_M,
     SIGMA_OUTLINE_REL,
-    SIGMA_ROLL_RAD,
     SIGMA_TILT_RAD,
     PeopleConfig,
 )
@@ -37,7 +36,6 @@ UNUSED_SIGMA = 1e3  # 1-sigma of an unused measurement
 MIN_DISTANCE_M = 0.7
 MIN_SLOPE = 1e-3
 MIN_DT_S = 1e-3
-MAX_HIDDEN_PROBABILITY = 0.01  # of the feet of a person who measures the road
 
 
 def measured_boxes(boxes: Sequence[PersonBox]) -> tuple[Floats, Floats]:
@@ -88,14 +86,14 @@ def expected_boxes(
 def road_tilts(
     boxes: Sequence[PersonBox], unseen_s: Sequence[float], road: RoadProfile, config: PeopleConfig
 ) -> RoadTilts:
-    """Tilts of the road beyond `road` at which complete boxes with visible feet have the mean height of their class.
+    """Tilts of the road beyond `road` at which complete boxes have the mean height of their class.
 
     `unseen_s` is the time since the last box of the same person. Most of the variance is that of the outline, which
     lasts for `outline_memory_s`.
     """
     rows = []
     for box, since_s in zip(boxes, unseen_s, strict=True):
-        if not box.is_complete or box.hidden > MAX_HIDDEN_PROBABILITY or box.tan_height <= MIN_SLOPE:
+        if not box.is_complete or box.hidden >= HIDDEN_CUT_PROBABILITY or box.tan_height <= MIN_SLOPE:
             continue
         sizes = config.sizes(box.label)
         tall = box.tan_height / (1.0 + sizes.foot_rel + sizes.head_rel)
@@ -104,8 +102,7 @@ def road_tilts(
         tilt = road.slope(max(depth - sizes.reach_m, MIN_DISTANCE_M)) - bottom
         slope = road.height_m / depth
         of_size = sizes.sigma_height_rel**2 + (2.0 * SIGMA_OUTLINE_REL) ** 2
-        variance = slope**2 * of_size + (SIGMA_KERB_M / depth) ** 2
-        variance += SIGMA_TILT_RAD**2 + (SIGMA_ROLL_RAD * box.bearing) ** 2
+        variance = slope**2 * of_size + (SIGMA_KERB_M / depth) ** 2 + SIGMA_TILT_RAD**2
         rows.append((tilt, box.bearing, slope, variance, max(1.0, OUTLINE_MEMORY_S / max(since_s, MIN_DT_S))))
     return RoadTilts(*np.array(rows).reshape(-1, 5).T)
 

@@ -14,7 +14,6 @@ TURNS_AFTER_S = 10.0  # mean time between changes of direction
 STOP_MPS = 0.08  # 1-sigma of the velocity of a standing person
 SIGMA_TILT_RAD = 0.009  # of the road at a person relative to the ego, beyond the front end's sigma
 TILT_DRIFT_RAD = 0.003  # and its change within a second as people walk
-SIGMA_ROLL_RAD = 0.01  # of the front end's roll, per unit of y/x
 SIGMA_KERB_M = 0.1  # 1-sigma of the ground offset under a person
 HIDDEN_SHARE = 0.3  # mean hidden fraction of the height with hidden feet
 SIGMA_HIDDEN_SHARE = 0.35  # 1-sigma of it

@@ -33,7 +33,6 @@ from birdslam.road_users.people.people_config import (
     OUTLINE_MEMORY_S,
     SIGMA_KERB_M,
     SIGMA_OUTLINE_REL,
-    SIGMA_ROLL_RAD,
     SIGMA_TILT_RAD,
     TILT_DRIFT_RAD,
     WIDTH_MEMORY_S,
@@ -157,7 +156,7 @@ class PeopleFilter:
         for k, box in enumerate(boxes):
             sizes = self.config.sizes(box.label)
             moves[k] = motion_parameters(sizes)
-            own_var[0, k] = SIGMA_TILT_RAD**2 + (SIGMA_ROLL_RAD * box.bearing) ** 2
+            own_var[0, k] = SIGMA_TILT_RAD**2
             rows[k] = [
                 sizes.reach_m, sizes.change_mps, math.log(sizes.width_m), sizes.sigma_width_rel,
                 sizes.foot_rel, -sizes.head_rel,

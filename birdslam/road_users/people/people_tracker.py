@@ -25,7 +25,7 @@ from birdslam.road_users.people.people_boxes import (
 )
 from birdslam.road_users.people.people_config import PeopleConfig
 from birdslam.road_users.people.people_filter import PeopleFilter
-from birdslam.road_users.placement.localisation import LocalisationConfig, iou
+from birdslam.road_users.placement.localisation import LocalisationConfig
 from birdslam.road_users.state.ground_size_filter import GroundSizeFilter
 from birdslam.road_users.track import Track, TrackingConfig
 from birdslam.types import FIRST_PERSON
@@ -38,13 +38,10 @@ SHAPE_DOF = 3.0  # of Student's t
 
 MIN_STATIONARY_PROBABILITY, MIN_STAY_PROBABILITY = 0.7, 0.4  # hysteresis of standing
 MAX_SQUARED_SIGMAS = 16.3  # squared Mahalanobis distance of bearing, bottom and top: 99.9 % of three
-BIRTH_IOU = 0.55  # maximum overlap with a tracked box to start a track
 FORGET_S = 1.5  # without a box, with an id
 SEEN_FOR_S = 1.1  # mean time until a person has no box
 HIDDEN_FOR_S = 0.65  # mean time until the box returns
 SIGMA_SHAPE = 0.07  # of the log aspect of a box, between two boxes
-SIGMA_STRIDE = 0.14  # and due to swinging limbs
-STRIDE_S = 1.0  # time constant of that
 SIGMA_SHAPES = 0.17  # of the log aspect among people
 MAX_TRACKS = 60  # maximum number of tracks: the nearest
 
@@ -135,7 +132,7 @@ class PeopleTracker:
         if not boxes or not self.tracks:
             return []
         squared, costs = self.filter.distances(boxes, frame.ego.T_world_ego, road)
-        costs += self._shape_costs(boxes, frame.ego.t_source_ns)
+        costs += self._shape_costs(boxes)
         squared, costs = np.where(costs[0] <= costs[1], squared[0], squared[1]), costs.min(axis=0)
         t_ns = frame.ego.t_source_ns
         since_s = max(
@@ -162,7 +159,7 @@ class PeopleTracker:
         all_votes = np.array([track.votes.total() for track in self.tracks])[:, None]
         return np.asarray(-2.0 * np.log((np.where(rides, all_votes - walked, walked) + 1.0) / (all_votes + 2.0)))
 
-    def _shape_costs(self, boxes: Sequence[PersonBox], t_ns: int) -> Floats:
+    def _shape_costs(self, boxes: Sequence[PersonBox]) -> Floats:
         """(2, N, M) -2 log likelihood ratio of the shape of each box, given the last box of each track.
 
         With visible feet (first) the aspect stays, with hidden feet (second) the width, while the height shrinks.
@@ -176,11 +173,9 @@ class PeopleTracker:
             )
             for of in (before, boxes)
         )
-        unseen_s = np.array([(t_ns - track.frame.t_source_ns) * 1e-9 for track in self.tracks])[:, None]
-        variance = SIGMA_SHAPE**2 - SIGMA_STRIDE**2 * np.expm1(-unseen_s / STRIDE_S)
         off = np.stack([np.subtract.outer(last, now), np.subtract.outer(last_width, now_width)])
-        squared = np.square(off) / variance
-        cost = (SHAPE_DOF + 1.0) * np.log1p(squared / SHAPE_DOF) + np.log(variance / SIGMA_SHAPES**2)
+        squared = np.square(off / SIGMA_SHAPE)
+        cost = (SHAPE_DOF + 1.0) * np.log1p(squared / SHAPE_DOF) + 2.0 * math.log(SIGMA_SHAPE / SIGMA_SHAPES)
         same = np.equal.outer([box.label for box in before], [box.label for box in boxes])
         return np.where(same, cost, 0.0)
 
@@ -188,12 +183,8 @@ class PeopleTracker:
         self, boxes: list[PersonBox], matched: set[int], frame: OpenFrame, road: RoadProfile
     ) -> list[PersonBox]:
         """Starts tracks of unmatched boxes, and returns these."""
-        followed = np.array([boxes[k].box_px for k in matched]).reshape(-1, 4)
-        births = [
-            boxes[k]
-            for k in self.life.births([box.score for box in boxes], matched)
-            if boxes[k].label != BICYCLE and iou(np.array([boxes[k].box_px]), followed).max(initial=0.0) <= BIRTH_IOU
-        ]
+        unmatched = self.life.births([box.score for box in boxes], matched)
+        births = [boxes[k] for k in unmatched if boxes[k].label != BICYCLE]
         ego = frame.ego
         self.filter.add_people(births, ego.T_world_ego, road)
         self.tracks.extend(PersonTrack(frame=ego, box=box, votes=Counter({box.label: 1})) for box in births)
