@@ -40,7 +40,7 @@ from birdslam.road_users.placement.uncertain_yaw import (
 )
 from birdslam.road_users.state.ground_size_filter import Depths, GroundSizeFilter
 from birdslam.road_users.state.parallax import LearnedSize, Parallax
-from birdslam.road_users.state.parallax_config import ParallaxConfig
+from birdslam.road_users.state.parallax_config import SIGMA_SIDE_OUTLIER_REL, ParallaxConfig
 from birdslam.road_users.state.parallax_measurements import measure_boxes
 from birdslam.road_users.state.yaw_by_outline import YawByOutline
 from birdslam.road_users.track import VehicleTrack
@@ -201,7 +201,7 @@ class Placing:
 
     def _with_side_outliers(self, assignments: Sequence[Assignment], sizes: LearnedSize) -> list[Assignment]:
         """Raises the sigmas of probable outlier sides of boxes."""
-        sigma_rel = self.parallax.config.sigma_side_outlier_rel * np.sqrt(sizes.side_outlier)
+        sigma_rel = SIGMA_SIDE_OUTLIER_REL * np.sqrt(sizes.side_outlier)
         out = []
         for a, (left_rel, right_rel) in zip(assignments, sigma_rel.tolist(), strict=True):
             seen = a.observation

@@ -64,6 +64,7 @@ from birdslam.road_users.people.people_state import (
     Y,
     merge_mixture,
 )
+from birdslam.road_users.state.motion_modes import ego_step_cov
 
 INITIAL_DEPTH_SIGMA_REL = 0.6
 BIRTH_ITERATIONS, ITERATIONS = 4, 1
@@ -137,12 +138,8 @@ class PeopleFilter:
             self._P[..., state, :] *= keep
             self._P[..., state] *= keep
             self._P[..., state, state] += (1.0 - keep**2) * SIGMA_OUTLINE_REL**2
-        if ego_cov is not None:  # an error of the ego step moves all people in ego
-            from_ego = self._x[..., :2] - [T_world_ego.x_m, T_world_ego.y_m]
-            J = np.zeros((n, FILTERS, 2, 3))
-            J[..., :2, :2] = T_world_ego.rotation()
-            J[..., 0, 2], J[..., 1, 2] = -from_ego[..., 1], from_ego[..., 0]
-            self._P[..., :2, :2] += J @ ego_cov @ J.swapaxes(-1, -2)
+        if ego_cov is not None:
+            self._P[..., :2, :2] += ego_step_cov(self._x[..., :2], T_world_ego, ego_cov)
 
     def add_people(self, boxes: Sequence[PersonBox], T_world_ego: SE2, road: RoadProfile) -> None:
         """Adds new people in rows after the others, and corrects them by their boxes."""

@@ -27,10 +27,28 @@ from birdslam.road_users.state.motion_modes import (
     WITHOUT_GROUND,
     birth_velocity_cov,
     birth_weights,
+    ego_step_cov,
     mix,
     process_noise,
 )
-from birdslam.road_users.state.parallax_config import ParallaxConfig
+from birdslam.road_users.state.parallax_config import (
+    GATE_SIGMA,
+    OUTLINE_DRIFT_REL,
+    PATH_HALF_WIDTH_M,
+    ROAD_HALF_WIDTH_M,
+    SIDE_OUTLIER_MEMORY_S,
+    SIGMA_ANOTHER_M,
+    SIGMA_ANOTHER_REL,
+    SIGMA_ANOTHER_SIZE_REL,
+    SIGMA_BANK_PER_M,
+    SIGMA_CROWN_RAD,
+    SIGMA_KERB_M,
+    SIGMA_SIDE_OUTLIER_REL,
+    SIGMA_TILT_RAD,
+    SIGMA_UNUSUAL_REL,
+    TILT_MEMORY_S,
+    ParallaxConfig,
+)
 from birdslam.road_users.state.parallax_measurements import (
     BY_HEIGHT,
     BY_WIDTH,
@@ -86,7 +104,7 @@ class Parallax:
 
     def __init__(self, config: ParallaxConfig) -> None:
         self.config = config
-        self._prior_weight = np.maximum(birth_weights(config), MIN_WEIGHT)
+        self._prior_weight = np.maximum(birth_weights(), MIN_WEIGHT)
         self._x = np.zeros((0, FILTERS, len(STATES)))
         self._P = np.zeros((0, FILTERS, len(STATES), len(STATES)))
         self._weight = np.zeros((0, len(MODES)))
@@ -123,14 +141,14 @@ class Parallax:
         P = np.zeros((1, FILTERS, len(STATES), len(STATES)))
         P[..., :2, :2] = np.eye(2) * (INITIAL_POSITION_SIGMA_REL * float(centre_m[0])) ** 2
         heading_rad = np.array([T_world_ego.yaw_rad + yaw_rad])
-        on_road = abs(float(centre_m[1])) < config.road_half_width_m
-        for moving, cov in birth_velocity_cov(config, heading_rad, on_road).items():
+        on_road = abs(float(centre_m[1])) < ROAD_HALF_WIDTH_M
+        for moving, cov in birth_velocity_cov(heading_rad, on_road).items():
             P[:, moving, VX:HEIGHT, VX:HEIGHT] = cov
         P[..., [HEIGHT, WIDTH], [HEIGHT, WIDTH]] = np.square(sigmas)
-        P[:, [UNUSUAL_SIZE, WITHOUT_GROUND[1]], HEIGHT, HEIGHT] = config.sigma_unusual_rel**2
-        P[..., TILT, TILT] = config.sigma_tilt_rad**2
+        P[:, [UNUSUAL_SIZE, WITHOUT_GROUND[1]], HEIGHT, HEIGHT] = SIGMA_UNUSUAL_REL**2
+        P[..., TILT, TILT] = SIGMA_TILT_RAD**2
         aside_m = float(centre_m[1])
-        below_m = config.sigma_kerb_m, config.sigma_crown_rad * aside_m, config.sigma_bank_per_m * aside_m**2
+        below_m = SIGMA_KERB_M, SIGMA_CROWN_RAD * aside_m, SIGMA_BANK_PER_M * aside_m**2
         P[..., OFFSET, OFFSET] = math.hypot(*below_m) ** 2
         self._x, self._P = np.concatenate([self._x, x]), np.concatenate([self._P, P])
         self._weight = np.concatenate([self._weight, self._prior_weight[None]])
@@ -143,36 +161,30 @@ class Parallax:
     def predict(self, dt_s: float, T_world_ego: SE2, ego_cov: Floats | None) -> None:
         """Predicts to the next frame; `ego_cov` (3, 3) is the covariance of the ego's step in its tangent space."""
         self._unseen_s += dt_s
-        self._side_outlier *= math.exp(-dt_s / self.config.side_outlier_memory_s)
+        self._side_outlier *= math.exp(-dt_s / SIDE_OUTLIER_MEMORY_S)
         if not len(self._x) or dt_s <= 0.0:
             return
-        config = self.config
         neighbour_cov = self._neighbour_covs(T_world_ego)
-        self._weight, self._x, self._P = mix(config, dt_s, self._weight, self._x, self._P, neighbour_cov)
-        decay = math.exp(-dt_s / config.tilt_memory_s)
+        self._weight, self._x, self._P = mix(self.config.own_for_s, dt_s, self._weight, self._x, self._P, neighbour_cov)
+        decay = math.exp(-dt_s / TILT_MEMORY_S)
         self._x[..., TILT] *= decay
         self._P[..., TILT, :] *= decay
         self._P[..., TILT] *= decay
-        self._P[..., TILT, TILT] += (1.0 - decay**2) * config.sigma_tilt_rad**2
+        self._P[..., TILT, TILT] += (1.0 - decay**2) * SIGMA_TILT_RAD**2
         F = np.eye(len(STATES))
         F[X, VX] = F[Y, VY] = dt_s
         self._x[:, MOVING_MODES] = self._x[:, MOVING_MODES] @ F.T
         self._P[:, MOVING_MODES] = F @ self._P[:, MOVING_MODES] @ F.T
-        self._P[:, MOVING_MODES, : VY + 1, : VY + 1] += process_noise(config, dt_s, self._yaw_rad, self._on_road)
-        if ego_cov is not None:  # an error of the ego step moves the vehicle in ego
-            at = self._x[..., :2] - [T_world_ego.x_m, T_world_ego.y_m]
-            J = np.zeros((*at.shape[:2], 2, 3))
-            J[..., :2, :2] = T_world_ego.rotation()
-            J[..., 0, 2], J[..., 1, 2] = -at[..., 1], at[..., 0]
-            self._P[..., :2, :2] += J @ ego_cov @ J.swapaxes(-1, -2)
+        self._P[:, MOVING_MODES, : VY + 1, : VY + 1] += process_noise(dt_s, self._yaw_rad, self._on_road)
+        if ego_cov is not None:
+            self._P[..., :2, :2] += ego_step_cov(self._x[..., :2], T_world_ego, ego_cov)
 
     def _neighbour_covs(self, T_world_ego: SE2) -> Floats:
         """(N, 8, 8) covariance of a parked neighbour's state about a vehicle's own."""
-        config = self.config
-        along = config.sigma_another_rel * (self._x[:, STATIONARY, :VX] - [T_world_ego.x_m, T_world_ego.y_m])
+        along = SIGMA_ANOTHER_REL * (self._x[:, STATIONARY, :VX] - [T_world_ego.x_m, T_world_ego.y_m])
         out = np.zeros((len(along), len(STATES), len(STATES)))
-        out[:, :VX, :VX] = along[:, :, None] * along[:, None, :] + config.sigma_another_m**2 * np.eye(2)
-        out[:, [HEIGHT, WIDTH], [HEIGHT, WIDTH]] = config.sigma_another_size_rel**2
+        out[:, :VX, :VX] = along[:, :, None] * along[:, None, :] + SIGMA_ANOTHER_M**2 * np.eye(2)
+        out[:, [HEIGHT, WIDTH], [HEIGHT, WIDTH]] = SIGMA_ANOTHER_SIZE_REL**2
         return out
 
     def learn_sizes(
@@ -184,7 +196,7 @@ class Parallax:
             return LearnedSize(nothing, nothing, nothing, np.zeros(0), np.zeros((0, 2)))
         config = self.config
         x, P = self._x[rows], self._P[rows]
-        outline_var = np.square(boxes.turned_rad) + config.outline_drift_rel**2 * self._unseen_s[rows]
+        outline_var = np.square(boxes.turned_rad) + OUTLINE_DRIFT_REL**2 * self._unseen_s[rows]
         P[..., WIDTH, WIDTH] += outline_var[:, None]
         innovation, J = linearised(x, boxes, T_world_ego, height_m)
         of_box, of_view = (
@@ -197,7 +209,7 @@ class Parallax:
         S = J @ PJt
         noise = self._noise(boxes, innovation, S, of_box, of_face * of_view)
         S = S + noise
-        shift = side_outlier_shift(boxes, innovation, config.sigma_side_outlier_rel * np.sqrt(of_box))
+        shift = side_outlier_shift(boxes, innovation, SIGMA_SIDE_OUTLIER_REL * np.sqrt(of_box))
         share = np.minimum(config.side_outlier + self._side_outlier[rows], MAX_SIDE_OUTLIER_PROBABILITY).T
         after = update_with_side_outliers(P, PJt, S, innovation, shift, share)
         self._x[rows] = x + after.step
@@ -209,7 +221,7 @@ class Parallax:
         self._weight[rows] = weight
         self._unseen_s[rows] = 0.0
         self._yaw_rad[rows] = boxes.yaw_rad + T_world_ego.yaw_rad
-        in_path = np.abs(boxes.bearing) * (boxes.depth_m + boxes.reach_m) < config.path_half_width_m
+        in_path = np.abs(boxes.bearing) * (boxes.depth_m + boxes.reach_m) < PATH_HALF_WIDTH_M
         side_outlier = (after.outlier[..., : len(MODES)] * weight).sum(axis=-1).T
         self._side_outlier[rows] = side_outlier
         return self._size_measurements(rows, of_face + config.sigma_scale_rel**2, in_path, side_outlier)
@@ -230,7 +242,7 @@ class Parallax:
         variance[:, WITHOUT_GROUND, GROUND] = UNKNOWN_VARIANCE
         noise = variance[..., None] * np.eye(len(CUES))
         nis = _squared_mahalanobis(innovation, S + noise).min(axis=1)
-        noise *= np.maximum(1.0, nis / self.config.gate_sigma**2)[:, None, None, None]
+        noise *= np.maximum(1.0, nis / GATE_SIGMA**2)[:, None, None, None]
         return noise
 
     def keep_rows(self, rows: Sequence[int]) -> None:
