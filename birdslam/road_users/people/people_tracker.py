@@ -26,6 +26,7 @@ from birdslam.road_users.people.people_boxes import (
 from birdslam.road_users.people.people_config import PeopleConfig
 from birdslam.road_users.people.people_filter import PeopleFilter
 from birdslam.road_users.placement.localisation import LocalisationConfig
+from birdslam.road_users.state.ground_size_config import TILT_MEMORY_S
 from birdslam.road_users.state.ground_size_filter import GroundSizeFilter
 from birdslam.road_users.track import Track, TrackingConfig
 from birdslam.types import FIRST_PERSON
@@ -124,7 +125,7 @@ class PeopleTracker:
         shift_rad = 0.0 if self._pitch_rad is None else pitch_rad - self._pitch_rad - (frame.turn_rad or 0.0)
         self._pitch_rad = pitch_rad
         driving = road.driving_share(frame.dt_s, frame.travelled_m)
-        keep_tilt = math.exp(-driving * frame.dt_s / road.config.tilt_memory_s)
+        keep_tilt = math.exp(-driving * frame.dt_s / TILT_MEMORY_S)
         self.filter.predict(frame.dt_s, ego.T_world_ego, ego.step_cov, shift_rad, driving, keep_tilt)
 
     def _associate(self, boxes: Sequence[PersonBox], frame: OpenFrame, road: RoadProfile) -> list[tuple[int, int]]:

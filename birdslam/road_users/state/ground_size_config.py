@@ -8,6 +8,27 @@ from numpy.typing import NDArray
 
 from birdslam.road_users.state.ground_measurements import CUES, Cue
 
+ROLL_MEMORY_S = 20.0  # correlation time of roll and crown, in driving time
+# Road and view change with the distance, not with time: the driving fraction of a second is 1 - exp(-speed / this)
+DRIVING_MPS = 1.0
+# Common relative offset of the heights: regional cars, edges of the detector
+SIGMA_COMMON_REL = 0.025  # 1-sigma
+SIZE_DOF = 4.0  # degrees of freedom of Student's t of the height; inf: normal distribution
+TILT_MEMORY_S = 5.0  # correlation time of the road's tilt at a road user, in driving time
+WIDTH_DRIFT_REL = 0.002  # of the outline, per frame
+WIDTH_TURN_REL = 1.0  # of the outline, per radian of rotation of the line of sight
+WIDTH_TURNED_REL = 0.6  # of a change of the outline by a yaw correction
+IMAGE_PITCH_SIGMA_REL = 0.5  # factor on the images' sigma of the pitch
+# 1-sigma of the systematic errors of the tilt by images
+SIGMA_IMAGE_PITCH_RAD = 0.002
+SIGMA_IMAGE_ROLL_RAD = 0.009  # the same of the roll
+IMAGE_PITCH_MEMORY_S = 1.5  # correlation time, in driving time
+IMAGE_ROLL_MEMORY_S = 5.0  # the same of the roll
+# Common relative offset of the heights of people, and common height of the pavement relative to the camera's
+SIGMA_BODIES_REL = 0.055
+SIGMA_PAVEMENT_REL = 0.036  # 1-sigma of the latter
+IMAGE_VAR = np.square([SIGMA_IMAGE_PITCH_RAD, SIGMA_IMAGE_ROLL_RAD])
+
 
 class GroundSizeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Priors of roads and vehicles, and correlation of the errors of boxes."""
@@ -15,14 +36,8 @@ class GroundSizeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sigma_pitch_rad: float = 0.010  # of the camera over the road about its calibration
     sigma_roll_rad: float = 0.02  # the same
     pitch_memory_s: float = 5.0  # correlation time of the pitch, in driving time
-    roll_memory_s: float = 20.0  # correlation time of roll and crown, in driving time
     sigma_pitch_step_rad: float = 0.0008  # per frame of driving: change of grade, odometry error
     sigma_pitch_blind_rad: float = 0.003  # per frame without odometry
-    # Road and view change with the distance, not with time: the driving fraction of a second is 1 - exp(-speed / this)
-    driving_mps: float = 1.0
-    # Common relative offset of the heights: regional cars, edges of the detector
-    sigma_common_rel: float = 0.025
-    size_dof: float = 4.0  # degrees of freedom of Student's t of the height; inf: normal distribution
     sigma_kerb_m: float = 0.018  # ground offset under a vehicle from the ego's plane
     sigma_common_edge_rel: float = 0.015  # of the height: common offset of all lower edges
     sigma_edge_rel: float = 0.022  # of the height: offset of the lower edge of a vehicle
@@ -33,31 +48,12 @@ class GroundSizeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # Scale of Student's t of the road's vertical curvature
     sigma_vertical_per_m: float = 1.5e-4
     vertical_dof: float = 6.0  # of that distribution
-    tilt_memory_s: float = 5.0  # correlation time of that tilt, in driving time
-    width_drift_rel: float = 0.002  # of the outline, per frame
-    width_turn_rel: float = 1.0  # of the outline, per radian of rotation of the line of sight
     # 1-sigma of the curvature of a vehicle's path: a bend of 200 m
     bend_per_m: float = 0.005
-    width_turned_rel: float = 0.6  # of a change of the outline by a yaw correction
     roof_reach_rel: float = 0.6  # of the vehicle's extent along the line of sight, to the edge of its roof
     cues: tuple[Cue, ...] = CUES  # measurements of a box that are used
     gate_sigma: float = 2.0  # Huber threshold of a measurement
-    image_pitch_sigma_rel: float = 0.5  # factor on the images' sigma of the pitch
-    # 1-sigma of the systematic errors of the tilt by images
-    sigma_image_pitch_rad: float = 0.002
-    sigma_image_roll_rad: float = 0.009  # the same of the roll
-    image_pitch_memory_s: float = 1.5  # correlation time, in driving time
-    image_roll_memory_s: float = 5.0  # the same of the roll
     box_memory_s: float = 0.5  # correlation time of the errors of a box, in driving time
-
-    # Common relative offset of the heights of people, and common height of the pavement relative to the camera's
-    sigma_bodies_rel: float = 0.055
-    sigma_pavement_rel: float = 0.036  # 1-sigma of the latter
-
-    @property
-    def image_var(self) -> NDArray[np.float64]:
-        """(2,) variances of the systematic errors of pitch and roll by images."""
-        return np.square([self.sigma_image_pitch_rad, self.sigma_image_roll_rad])
 
     @property
     def road_var(self) -> NDArray[np.float64]:
@@ -67,4 +63,4 @@ class GroundSizeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     @property
     def road_memory_s(self) -> NDArray[np.float64]:
         """(3,) their correlation times, in driving time."""
-        return np.array([self.pitch_memory_s, self.roll_memory_s, self.roll_memory_s])
+        return np.array([self.pitch_memory_s, ROLL_MEMORY_S, ROLL_MEMORY_S])

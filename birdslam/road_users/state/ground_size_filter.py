@@ -40,7 +40,22 @@ from birdslam.road_users.state.ground_measurements import (
     expected_boxes,
     robust_information,
 )
-from birdslam.road_users.state.ground_size_config import GroundSizeConfig
+from birdslam.road_users.state.ground_size_config import (
+    DRIVING_MPS,
+    IMAGE_PITCH_MEMORY_S,
+    IMAGE_PITCH_SIGMA_REL,
+    IMAGE_ROLL_MEMORY_S,
+    IMAGE_VAR,
+    SIGMA_BODIES_REL,
+    SIGMA_COMMON_REL,
+    SIGMA_PAVEMENT_REL,
+    SIZE_DOF,
+    TILT_MEMORY_S,
+    WIDTH_DRIFT_REL,
+    WIDTH_TURN_REL,
+    WIDTH_TURNED_REL,
+    GroundSizeConfig,
+)
 from birdslam.road_users.state.parallax import LearnedSize
 from birdslam.road_users.state.size_prior import MIN_VARIANCE, SizePrior
 
@@ -86,10 +101,10 @@ class GroundSizeFilter:
         self._driven_s = np.zeros(0)  # driving time of the ego in it
         self._sigma_tilt = np.zeros(0)
         self._x = np.array([camera.pitch_rad, camera.roll_rad, *np.zeros(COMMON - 2)])
-        self._body_var = config.sigma_bodies_rel**2 + config.sigma_pavement_rel**2
-        common = np.square([config.sigma_common_rel, config.sigma_common_edge_rel])
-        self._P = np.diag([*config.road_var, *config.image_var, *common, FLAT_VARIANCE, self._body_var])
-        self._sizes = SizePrior(config.sigma_common_rel, config.size_dof)
+        self._body_var = SIGMA_BODIES_REL**2 + SIGMA_PAVEMENT_REL**2
+        common = np.square([SIGMA_COMMON_REL, config.sigma_common_edge_rel])
+        self._P = np.diag([*config.road_var, *IMAGE_VAR, *common, FLAT_VARIANCE, self._body_var])
+        self._sizes = SizePrior(SIGMA_COMMON_REL, SIZE_DOF)
         self._image_ground = camera.ground
 
     def __len__(self) -> int:
@@ -123,7 +138,7 @@ class GroundSizeFilter:
     @property
     def bodies(self) -> tuple[float, float]:
         """Common log factor on the heights of people, and its variance; the rest of the state is the pavement's."""
-        of_bodies = self.config.sigma_bodies_rel**2
+        of_bodies = SIGMA_BODIES_REL**2
         share = of_bodies / self._body_var
         return share * float(self._x[BODY]), share**2 * float(self._P[BODY, BODY]) + (1.0 - share) * of_bodies
 
@@ -188,8 +203,8 @@ class GroundSizeFilter:
         self._driven_s = self._driven_s + share * dt_s
         self._x[PITCH] += turn_rad or 0.0
         keep = np.exp(-share * dt_s / config.road_memory_s)
-        keep_image = np.exp(-share * dt_s / np.array([config.image_pitch_memory_s, config.image_roll_memory_s]))
-        keep_tilt = math.exp(-share * dt_s / config.tilt_memory_s)
+        keep_image = np.exp(-share * dt_s / np.array([IMAGE_PITCH_MEMORY_S, IMAGE_ROLL_MEMORY_S]))
+        keep_tilt = math.exp(-share * dt_s / TILT_MEMORY_S)
         scale = np.ones(len(self._x))
         scale[_ROAD], scale[_IMAGES], scale[COMMON + TILT :: OWN] = keep, keep_image, keep_tilt
         self._x *= scale
@@ -197,7 +212,7 @@ class GroundSizeFilter:
         self._P *= np.outer(scale, scale)
         noise = np.zeros(len(self._x))
         noise[_ROAD] = (1.0 - keep**2) * config.road_var
-        noise[_IMAGES] = (1.0 - keep_image**2) * config.image_var
+        noise[_IMAGES] = (1.0 - keep_image**2) * IMAGE_VAR
         noise[COMMON + TILT :: OWN] = (1.0 - keep_tilt**2) * np.square(self._sigma_tilt)
         step = config.sigma_pitch_blind_rad if turn_rad is None else config.sigma_pitch_step_rad
         noise[PITCH] += share * step**2
@@ -211,7 +226,7 @@ class GroundSizeFilter:
         """Compensates a yaw correction that scales the class's outline by exp(log_outline)."""
         at = COMMON + OWN * row + OUTLINE
         self._x[at] -= log_outline
-        self._P[at, at] += (self.config.width_turned_rel * log_outline) ** 2
+        self._P[at, at] += (WIDTH_TURNED_REL * log_outline) ** 2
 
     def reclassify(self, row: int, dimensions: Dimensions, log_outline: float) -> None:
         """Replaces the prior of the height by that of another class, with an outline larger by exp(log_outline)."""
@@ -280,14 +295,14 @@ class GroundSizeFilter:
         config = self.config
         own_turn = 0.0 if learned is None else config.bend_per_m * learned.speed_mps  # per second
         own_var = np.square(own_turn) * self._unseen_s[rows]
-        out: Floats = config.width_drift_rel**2 + config.width_turn_rel**2 * (np.square(turned_rad) + own_var)
+        out: Floats = WIDTH_DRIFT_REL**2 + WIDTH_TURN_REL**2 * (np.square(turned_rad) + own_var)
         return out
 
     def driving_share(self, dt_s: float, travelled_m: float | None) -> float:
         """Driving fraction of a step of the ego; a step of unknown length is treated as driving."""
         if travelled_m is None:
             return 1.0
-        return -math.expm1(-travelled_m / max(dt_s, _MIN_DT_S) / self.config.driving_mps)
+        return -math.expm1(-travelled_m / max(dt_s, _MIN_DT_S) / DRIVING_MPS)
 
     def _correlated_frames(self, rows: Sequence[int], learned: LearnedSize | None) -> Floats:
         """(N,) number of consecutive frames with the same error, from the change of view since the last observation.
@@ -295,7 +310,7 @@ class GroundSizeFilter:
         Errors of a box decorrelate as ego or vehicle move. While both are stationary, all images show the same error.
         """
         speed_mps = np.zeros(len(rows)) if learned is None else learned.speed_mps
-        stationary_s = (self._unseen_s - self._driven_s)[rows] * np.exp(-speed_mps / self.config.driving_mps)
+        stationary_s = (self._unseen_s - self._driven_s)[rows] * np.exp(-speed_mps / DRIVING_MPS)
         changed_s = np.maximum(self._unseen_s[rows] - stationary_s, _MIN_DRIVING_RATIO)
         correlated: Floats = np.maximum(1.0, self.config.box_memory_s / changed_s)
         self._unseen_s[rows] = self._driven_s[rows] = 0.0
@@ -338,7 +353,7 @@ class GroundSizeFilter:
 
     def _correct_tilt(self, by_images: GroundPlane, cov: Floats) -> None:
         """Updates with pitch and roll by images, which have systematic errors."""
-        sigma_rel = np.array([self.config.image_pitch_sigma_rel, 1.0])
+        sigma_rel = np.array([IMAGE_PITCH_SIGMA_REL, 1.0])
         PHt = self._P[:, _TILTS] + self._P[:, _IMAGES]
         gain = PHt @ np.linalg.inv(PHt[_TILTS] + PHt[_IMAGES] + cov * np.outer(sigma_rel, sigma_rel))
         expected = self._x[_TILTS] + self._x[_IMAGES]

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.se2 import SE2
+from birdslam.road_users.state.ground_size_config import TILT_MEMORY_S
 from birdslam.road_users.state.motion_modes import (
     FILTERS,
     MODES,
@@ -46,7 +47,6 @@ from birdslam.road_users.state.parallax_config import (
     SIGMA_SIDE_OUTLIER_REL,
     SIGMA_TILT_RAD,
     SIGMA_UNUSUAL_REL,
-    TILT_MEMORY_S,
     ParallaxConfig,
 )
 from birdslam.road_users.state.parallax_measurements import (

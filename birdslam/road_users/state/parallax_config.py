@@ -23,7 +23,6 @@ CHANGE_MPS = 2.0  # 1-sigma of the change of velocity within a second
 CHANGE_ACROSS_MPS = 0.5  # the same across the heading
 OUTLINE_DRIFT_REL = 0.03  # of the width of the outline, within a second
 SIGMA_TILT_RAD = 0.004  # of the road at a vehicle relative to the ego
-TILT_MEMORY_S = 5.0  # correlation time of it
 SIGMA_KERB_M = 0.06  # ground offset under a vehicle from the ego's plane
 SIGMA_CROWN_RAD = 0.007  # and its growth with the lateral distance
 SIGMA_BANK_PER_M = 0.001  # and with the square of it
