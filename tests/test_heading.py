@@ -11,7 +11,14 @@ from birdslam.bench.tracking.localisation import INSIDE_2_SIGMA
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.road_users.placement.localisation import LocalisationConfig, Observation, observe_boxes, place
-from birdslam.road_users.placement.uncertain_yaw import HeadingConfig, YawPrior, initial_yaw_rad, marginalise_yaw
+from birdslam.road_users.placement.uncertain_yaw import (
+    HeadingConfig,
+    YawPrior,
+    evaluate_yaws,
+    initial_yaw_rad,
+    make_fan,
+    weigh_yaws,
+)
 from tests.boxes import CAR, cuboid_px, footprint_m
 from tests.recordings import KITTI as CAMERA
 
@@ -33,9 +40,9 @@ def placed(
     """(centre, cov) without and with the uncertainty of the yaw."""
     log_depth = math.log(depth_m)
     sharp = place(seen, log_depth, SIGMA_DEPTH**2, float(headings.yaw_rad[0]), localisation)
-    shift, cov = marginalise_yaw(
-        [seen], np.array([log_depth]), np.array([SIGMA_DEPTH**2]), headings, localisation, CONFIG
-    )
+    yaws = make_fan(headings, np.arange(CONFIG.fan, dtype=np.float64) * (math.pi / CONFIG.fan))
+    fan = evaluate_yaws([seen], np.array([log_depth]), yaws, localisation.reach_rel)
+    shift, cov = fan.marginalised(weigh_yaws(fan, np.array([SIGMA_DEPTH**2]), headings, CONFIG))
     return (sharp.centre_m, sharp.cov), (sharp.centre_m + shift[0], sharp.cov + cov[0])
 
 

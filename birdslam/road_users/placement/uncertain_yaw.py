@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.road_users.placement.localisation import CENTRE_STEPS, LocalisationConfig, Observation, extent_m
+from birdslam.road_users.placement.localisation import CENTRE_STEPS, Observation, extent_m
 
 Floats = NDArray[np.float64]
 Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
@@ -145,22 +145,3 @@ def weigh_yaws(fan: YawFan, variance: Floats, yaws_prior: YawPrior, config: Head
     noise = (variance + config.sigma_width_rel**2 + fan.box_variance)[:, None]
     weight: Floats = prior * np.exp(-0.5 * fan.residual**2 / noise) + prior * _MIN_WEIGHT
     return weight / weight.sum(axis=1, keepdims=True)
-
-
-def marginalise_yaw(
-    seen: Sequence[Observation],
-    log_depth: Floats,
-    variance: Floats,
-    yaws_prior: YawPrior,
-    localisation: LocalisationConfig,
-    config: HeadingConfig,
-) -> tuple[Floats, Floats]:
-    """Shift of the centre (N, 2) from that at the mean yaw (m, ego), and its covariance (N, 2, 2) due to yaw.
-
-    `log_depth` (N,) of the nearest faces has the `variance` (N,); the yaws have only their prior.
-    """
-    if not seen:
-        return np.zeros((0, 2)), np.zeros((0, 2, 2))
-    yaws = make_fan(yaws_prior, np.arange(config.fan, dtype=np.float64) * (math.pi / config.fan))
-    fan = evaluate_yaws(seen, log_depth, yaws, localisation.reach_rel)
-    return fan.marginalised(weigh_yaws(fan, variance, yaws_prior, config))
