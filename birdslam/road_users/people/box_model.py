@@ -89,7 +89,7 @@ def road_tilts(
     """Tilts of the road beyond `road` at which complete boxes have the mean height of their class.
 
     `unseen_s` is the time since the last box of the same person. Most of the variance is that of the outline, which
-    lasts for `outline_memory_s`.
+    lasts for OUTLINE_MEMORY_S.
     """
     rows = []
     for box, since_s in zip(boxes, unseen_s, strict=True):

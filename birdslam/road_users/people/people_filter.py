@@ -199,9 +199,8 @@ class PeopleFilter:
             return
         at = np.asarray(rows)
         z, R = self._measured(at, boxes)  # (M, 4), (M, 4, 4)
-        counts = np.minimum(1.0, self._unseen_s[at] / BOX_MEMORY_S)[
-            :, None, None
-        ]  # effective number of independent boxes
+        independent = np.minimum(1.0, self._unseen_s[at] / BOX_MEMORY_S)  # effective number of boxes
+        counts = independent[:, None, None]
         hidden = np.array([box.hidden for box in boxes])
         x0, P0 = self._x[at][:, :, None], self._P[at][:, :, None]  # (M, K, 1, 9)
         x = np.repeat(x0, 2, axis=2)
@@ -289,9 +288,8 @@ class PeopleFilter:
         expected, J = expected_boxes(x, T_world_ego, road, self._sizes[:, 0], self._sizes[:, 2])
         expected, J = expected[..., :WIDTH], J[..., :WIDTH, :]
         S = J @ self._P[:, :, None] @ J.swapaxes(-1, -2)
-        mean, S = merge_mixture(
-            expected.swapaxes(1, 2), S.swapaxes(1, 2), self._weight[:, None]
-        )  # (N, 2, 3), (N, 2, 3, 3)
+        # (N, 2, 3), (N, 2, 3, 3)
+        mean, S = merge_mixture(expected.swapaxes(1, 2), S.swapaxes(1, 2), self._weight[:, None])
         z, R = measured_boxes(boxes)
         noise = np.stack([R, R])
         hide_feet(noise[1], np.exp(z[:, TALL]) / (1.0 - HIDDEN_SHARE))

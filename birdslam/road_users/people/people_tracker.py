@@ -34,9 +34,6 @@ from birdslam.types import FIRST_PERSON
 NEW_PER_S = 1.0  # rate of new people, per unit of bearing, slope and log height
 SIDE_MARGIN = 0.03  # of the image width, beyond which a person has left
 MAX_OUTSIDE_S = 0.3  # until a person outside the image is removed
-
-SHAPE_DOF = 3.0  # of Student's t
-
 MIN_STATIONARY_PROBABILITY, MIN_STAY_PROBABILITY = 0.7, 0.4  # hysteresis of standing
 MAX_SQUARED_SIGMAS = 16.3  # squared Mahalanobis distance of bearing, bottom and top: 99.9 % of three
 FORGET_S = 1.5  # without a box, with an id
@@ -44,6 +41,7 @@ SEEN_FOR_S = 1.1  # mean time until a person has no box
 HIDDEN_FOR_S = 0.65  # mean time until the box returns
 SIGMA_SHAPE = 0.07  # of the log aspect of a box, between two boxes
 SIGMA_SHAPES = 0.17  # of the log aspect among people
+SHAPE_DOF = 3.0  # of Student's t of the log aspect
 MAX_TRACKS = 60  # maximum number of tracks: the nearest
 
 
@@ -135,10 +133,8 @@ class PeopleTracker:
         squared, costs = self.filter.distances(boxes, frame.ego.T_world_ego, road)
         costs += self._shape_costs(boxes)
         squared, costs = np.where(costs[0] <= costs[1], squared[0], squared[1]), costs.min(axis=0)
-        t_ns = frame.ego.t_source_ns
-        since_s = max(
-            (t_ns - max(track.frame.t_source_ns for track in self.tracks)) * 1e-9, MIN_DT_S
-        )  # anybody had a box
+        last_ns = max(track.frame.t_source_ns for track in self.tracks)
+        since_s = max((frame.ego.t_source_ns - last_ns) * 1e-9, MIN_DT_S)
         costs += self._detection_costs(since_s) + self._class_costs(boxes)
         return self.life.associate(costs, squared <= MAX_SQUARED_SIGMAS, -2.0 * math.log(NEW_PER_S * since_s))
 
