@@ -60,12 +60,16 @@ class Film:
     gps: str | None = None  # file of times and speeds
     speed_mps: float | None = None  # constant speed
     between_mps: tuple[float, float] | None = None  # bounds of its speed
+    camera: str | None = None  # the film whose camera file it shares
 
 
 FILMS = {
     "town": Film("video:{data}/dashcam/town.mp4", gps="dashcam/town_gps.csv"),
     # The field of view that matches GPS: not a test of the scale, but of the rest
     "town_72": Film("video:{data}/dashcam/town.mp4", gps="dashcam/town_gps.csv"),
+    "overtaken": Film(
+        "video:{data}/dashcam/town_overtaken.mp4", gps="dashcam/town_overtaken_gps.csv", camera="town_72"
+    ),
     "motorway": Film("video:{data}/highway/solidWhiteRight.mp4", speed_mps=25.4),
     "rain": Film("video:{data}/dashcam/rain.mp4", between_mps=(15.0, 35.0)),
     "00": Film("kitti:{data}/kitti_odometry/sequences/00"),
@@ -73,7 +77,7 @@ FILMS = {
     "06": Film("kitti:{data}/kitti_odometry/sequences/06"),
     "01": Film("kitti:{data}/kitti_odometry/sequences/01"),
 }
-DEFAULT = ("town", "town_72", "motorway", "00", "0005")
+DEFAULT = ("town", "town_72", "overtaken", "motorway", "00", "0005")
 # Camera files of `birdslam calibrate`, fixed, so that the table compares variants and not calibrations
 CAMERAS = Path(__file__).resolve().parents[1] / "film_cameras"
 
@@ -127,7 +131,7 @@ def measure_all(options: argparse.Namespace) -> None:
 
 def camera_of(name: str) -> Camera | None:
     """The fixed camera of a film; None for a recording with a camera file."""
-    path = CAMERAS / f"{name}.toml"
+    path = CAMERAS / f"{FILMS[name].camera or name}.toml"
     return load_camera(path) if path.is_file() else None
 
 

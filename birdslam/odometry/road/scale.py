@@ -273,7 +273,7 @@ class RoadScale:
         """The keyframe image to align with: the one with the baseline nearest to the target."""
         if self._is_doubtful():
             # Baselines are unknown: try the oldest image, then the newest, and so on
-            return self._keyframes.candidate(self._confirmation.rejections)
+            return self._keyframes.candidate(self._confirmation.uninformative)
         return self._keyframes.at_baseline(pose, self.config.target_baseline_m, self.config.min_baseline_m)
 
     def _align_and_update(

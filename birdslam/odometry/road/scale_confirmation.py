@@ -20,7 +20,7 @@ class ScaleConfirmation:
         self._informative = 0.0  # sum over consecutive alignments, each 0 to 1
         self._opposing = 0.0  # the same sum for the length before
         self._rejected = 0.0  # consecutive ones, each by the new fraction of its path
-        self.rejections = 0  # consecutive ones
+        self.uninformative = 0  # consecutive alignments, rejected or without information about the length
         self._found: list[float | None] = []  # log length of a search in each; None if it found none
         self._mean, self._comparisons = 0.0, 0  # running mean of the information, and its number of samples
 
@@ -62,7 +62,7 @@ class ScaleConfirmation:
     def reject(self, new: float, found_log: float | None = None) -> None:
         """Adds a rejected alignment; `new` is the new fraction of its path, `found_log` the log length of a search."""
         self._rejected += new
-        self.rejections += 1
+        self.uninformative += 1
         self._found = [*self._found[1 - _MAX_REJECTED_COUNT :], found_log]
 
     def was_found_before(self, log_length: float) -> bool:
@@ -84,8 +84,7 @@ class ScaleConfirmation:
         """Adds an accepted alignment, which reduces the rejections by its information (0 to 1)."""
         self._rejected *= 1.0 - information
         self._found = []  # the scale changes
-        if information >= MIN_INFORMATIVE_RATIO:
-            self.rejections = 0
+        self.uninformative = 0 if information >= MIN_INFORMATIVE_RATIO else self.uninformative + 1
 
     def confirm(self, information: float, log_factor: float) -> None:
         """Adds the information of an accepted alignment that changed the log length by `log_factor`."""
