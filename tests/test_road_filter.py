@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -46,6 +47,24 @@ def test_image_comparison_distinguishes_sag_and_crest(rears_m: tuple[float, ...]
     """One pair of images determines it to 50 % at best."""
     seen = [float(compared(rear_m, 7.5 * curvature_per_m).state[3]) for rear_m in rears_m]
     assert 0.5 < np.mean(seen) / curvature_per_m < 2.0
+
+
+def sigma_after(distance_m: float, distortion_sigma: float) -> float:
+    """1-sigma of the log scale after a known scale and `distance_m` without an alignment."""
+    filter_ = RoadFilter(msgspec.structs.replace(CAMERA, distortion_sigma=distortion_sigma), RoadScaleConfig())
+    filter_.reset_scale(0.01)
+    for _ in range(round(distance_m)):
+        filter_.predict(np.eye(3), 1.0)
+    return math.sqrt(filter_.cov[0, 0])
+
+
+def test_an_uncertain_distortion_is_a_drift_of_the_scale() -> None:
+    """A landmark that moves to the edge (r) changes its depth by 2 r^2 times the error of k1."""
+    measured, uncertain = sigma_after(20.0, 0.0), sigma_after(20.0, 0.1)
+    edge = 0.5 * CAMERA.width_px / CAMERA.fx_px
+    assert measured < 0.05
+    assert uncertain > 20.0 * 0.1 * edge**2 / 10.0 * math.exp(-20.0 / 100.0)
+    assert sigma_after(20.0, 0.2) / uncertain == pytest.approx(2.0, rel=0.05)
 
 
 def test_the_plane_under_the_camera_turns_with_the_road() -> None:

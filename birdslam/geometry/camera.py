@@ -98,6 +98,7 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     readout_s: Annotated[float, msgspec.Meta(ge=0.0, le=0.1)] = 0.0  # from the first row to the last; 0: global shutter
     # 1-sigma of the scale as a fraction if height or focal length are estimated; 0: they were measured
     scale_sigma_rel: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.0
+    distortion_sigma: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.0  # 1-sigma of k1; 0: it was measured
 
     def __post_init__(self) -> None:
         lens = (self.fx_px, self.fy_px, self.cx_px, self.cy_px, *self.distortion)

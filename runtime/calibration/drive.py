@@ -79,6 +79,7 @@ def calibrate_drive(
     recording, every = _open_slowly(uri, lens, height_m, stride, topics)
     if pitch is not None:
         recording.camera = msgspec.structs.replace(recording.camera, pitch_rad=pitch.pitch_rad)
+    recording.camera = msgspec.structs.replace(recording.camera, distortion_sigma=k1_sigma)
     readout: Readout | None = None
     # In a portrait video the rows of the sensor are columns of the image
     if is_film and recording.camera.width_px >= recording.camera.height_px:

@@ -19,6 +19,7 @@ Floats = NDArray[np.float64]
 STATES = ROAD + 3  # log lambda, pitch, roll, curvature; the mount's pitch and roll; the drift of log lambda
 DRIFT = STATES - 1
 _UNKNOWN_LENGTH_SIGMA_LOG = 10.0  # 1-sigma of an unknown log length
+_LANDMARK_M = 10.0  # travelled from the triangulation of a landmark to its exit at the edge of the image
 _WRONG_PITCH_SIGMAS = 2.0  # of the first direction of travel, above which the camera file's pitch is wrong
 _MAX_FACTOR_SIGMAS = 1.5  # of the factor's prior
 CAR_FACTOR, CAR_DELAY, ROAD_ERROR = STATES, STATES + 1, STATES + 2  # with the car's own speed
@@ -46,8 +47,9 @@ class RoadFilter:
         self.config = config
         self.x = np.array([0.0, camera.pitch_rad, camera.roll_rad, 0.0, camera.pitch_rad, camera.roll_rad, 0.0])
         mount, tilt = config.sigma_mount_rad**2, config.sigma_mount_rad**2 + config.sigma_bounce_rad**2
+        self._drift_var = config.scale_drift_per_m**2 + _distortion_drift_per_m(camera) ** 2
         self.cov: Floats = np.diag(
-            [1.0, tilt, tilt, config.sigma_curvature_per_m**2, mount, mount, config.scale_drift_per_m**2]
+            [1.0, tilt, tilt, config.sigma_curvature_per_m**2, mount, mount, self._drift_var]
         )
         self.cov[[1, 2, 4, 5], [4, 5, 1, 2]] = mount
         self.pending_log = 0.0  # correction of log lambda that the caller has yet to apply
@@ -131,7 +133,7 @@ class RoadFilter:
         walk = cfg.tilt_walk_rad_per_sqrt_m**2 * travelled_m + 1e-8
         mount = cfg.mount_walk_rad_per_sqrt_m**2 * travelled_m
         bend = (1.0 - fade**2) * cfg.sigma_curvature_per_m**2
-        noise = [0.0, walk, walk, bend, mount, mount, (1.0 - decay**2) * cfg.scale_drift_per_m**2]
+        noise = [0.0, walk, walk, bend, mount, mount, (1.0 - decay**2) * self._drift_var]
         if self.has_car_states:
             decay = float(np.exp(-travelled_m / cfg.car.road_error_m))
             F[ROAD_ERROR, ROAD_ERROR] = decay
@@ -281,3 +283,13 @@ class RoadFilter:
             self._update(np.array([-off]), H, np.array([[self.config.car.sigma_factor_rel**2]]))
         step, self.pending_log = self.pending_log - before, before
         return float(np.exp(np.clip(step, -4.0, 4.0)))
+
+
+def _distortion_drift_per_m(camera: Camera) -> float:
+    """1-sigma of the drift of the log scale (1/m) by an error of k1.
+
+    An error of k1 by e changes the depth of a landmark at radius r (z = 1) by the factor 1 - 2 e r^2. So the scale
+    changes by e times the squared radius of the edge while landmarks move there from the centre of the image.
+    """
+    edge = 0.5 * camera.width_px / camera.fx_px
+    return camera.distortion_sigma * edge**2 / _LANDMARK_M
