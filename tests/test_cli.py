@@ -144,6 +144,8 @@ def test_invalid_frames_to_compare_are_a_one_line_error(
         (("--source", "demo", "--camera", "CAMERA", "--height", "1.4"), "the camera file has a height already"),
         (("--source", "v4l2:/dev/video9", "--height", "1.4"), "is live and has no first pass"),
         (("--source", "video:FILM", "--height", "1.4", "--fov", "3"), "--fov 3: expected a field of view"),
+        (("--source", "video:FILM", "--height", "1.4", "--fov-sigma", "5"), "--fov-sigma: needs --fov"),
+        (("--source", "video:FILM", "--height", "1.4", "--fov", "60", "--fov-sigma", "0"), "--fov-sigma 0: expected"),
     ],
 )
 def test_an_impossible_first_pass_is_rejected(

@@ -280,6 +280,8 @@ def test_a_phones_metadata_state_the_focal_length(suffix: str, tmp_path: Path) -
     assert (
         "as stated, 60 deg" in focal_length_of(Given(fov_deg=60.0), f"video:{path}", (WIDTH, HEIGHT))[2]
     )  # goes before it
+    measured = focal_length_of(Given(fov_deg=60.0, fov_sigma_percent=2.0), f"video:{path}", (WIDTH, HEIGHT))
+    assert (measured.sigma_rel, measured.by_view) == (0.02, False)
     without = film(tmp_path / f"other.{suffix}", range(0, 200, 40))
     assert VideoRecording.stated_focal_px(without) is None
     assert "that of a phone" in focal_length_of(Given(kind="phone"), f"video:{without}", (WIDTH, HEIGHT))[2]

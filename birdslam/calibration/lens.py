@@ -40,7 +40,7 @@ _BLOCKS = 8  # parts of the drive for the sigma
 _MAX_SIGMA_RATIO = 0.7  # max. ratio to the prior's sigma at which the estimate replaces the prior
 # Horizontal field of view and 1-sigma of the focal length as a fraction, by kind of camera
 FIELD_OF_VIEW_DEG = {"dashcam": (75.0, 0.25), "phone": (65.0, 0.1)}
-STATED_SIGMA_REL = 0.03  # of a focal length from a stated field of view
+STATED_SIGMA_REL = 0.1  # of a focal length from a nominal field of view: data sheets state the diagonal, or round
 # Above this field of view lenses are about equidistant
 WIDE_DEG = 110.0
 # 1-sigma of its focal length: equisolid and stereographic lenses are 4 to 6 % and 8 to 15 % off (110, 140 degrees)

@@ -45,6 +45,7 @@ class Given:
     square_m: float = 0.025
     height_m: float | None = None
     fov_deg: float | None = None  # horizontal field of view, for an unknown lens
+    fov_sigma_percent: float | None = None  # 1-sigma of its focal length; None: a nominal field of view
     kind: str = "dashcam"  # kind of camera, if the field of view is unknown too
     speed: Path | None = None  # lines of time in s, speed in m/s
     size: KnownSize = _NO_SIZE
@@ -111,7 +112,13 @@ def focal_length_of(given: Given, uri: str, size_px: tuple[int, int]) -> FocalLe
             raise ConfigurationError(f"--fov {given.fov_deg:g}: expected a field of view of 10 to 150 deg")
         words, fisheye = f"as stated, {given.fov_deg:g} deg across", given.fov_deg >= WIDE_DEG
         focal_px = focal_by_field_of_view(width_px, given.fov_deg, fisheye)
+        if given.fov_sigma_percent is not None:
+            if not 0.1 <= given.fov_sigma_percent <= 50.0:
+                raise ConfigurationError(f"--fov-sigma {given.fov_sigma_percent:g}: expected 0.1 to 50 per cent")
+            return FocalLength(focal_px, 0.01 * given.fov_sigma_percent, words, by_view=False, fisheye=fisheye)
         return FocalLength(focal_px, WIDE_SIGMA_REL if fisheye else STATED_SIGMA_REL, words, fisheye=fisheye)
+    if given.fov_sigma_percent is not None:
+        raise ConfigurationError("--fov-sigma: needs --fov")
     kind, path = class_and_path(uri)
     stated_px = kind.stated_focal_px(path)
     if stated_px is not None and focal_by_field_of_view(width_px, 150.0) < stated_px:

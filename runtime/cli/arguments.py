@@ -116,6 +116,8 @@ def add_lens(parser: argparse.ArgumentParser) -> None:
     """Adds the field of view of a film without a camera file."""
     text = "horizontal field of view, for a film whose metadata do not have it"
     parser.add_argument("--fov", type=float, metavar="DEG", help=text)
+    text = "1-sigma of the focal length by --fov, including the effect of distortion (default: 10, and distortion)"
+    parser.add_argument("--fov-sigma", type=float, metavar="PERCENT", help=text)
     text = (
         "width of the drive's lanes between the middles of their lines, or size of the vehicle that is in view for "
         "most frames, car=LxWxH; sets the scale of a film without --height"

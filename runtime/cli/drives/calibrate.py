@@ -50,6 +50,7 @@ def run(options: argparse.Namespace) -> int:
         square_m=options.square_mm / 1000.0,
         height_m=options.height,
         fov_deg=options.fov,
+        fov_sigma_percent=options.fov_sigma,
         kind=options.kind,
         speed=options.known_speed,
         size=known_length_of(options.known_length),

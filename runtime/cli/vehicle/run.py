@@ -175,6 +175,7 @@ def _calibrated(
         intrinsics=lens,
         height_m=options.height,
         fov_deg=options.fov,
+        fov_sigma_percent=options.fov_sigma,
         kind=options.kind,
         speed=speed,
         size=known_length_of(options.known_length),
