@@ -24,7 +24,15 @@ from birdslam.calibration.calibration import (
     calibrate,
 )
 from birdslam.calibration.camera_files import read_intrinsics
-from birdslam.calibration.height_check import HeightCheck, VehicleHeightConfig, checks_by_vehicles, solve_mounting
+from birdslam.calibration.height_check import (
+    SPEED,
+    HeightCheck,
+    HeightCheckConfig,
+    VehicleHeightConfig,
+    checks_by_length,
+    checks_by_vehicles,
+    solve_mounting,
+)
 from birdslam.calibration.intrinsics import from_chessboard
 from birdslam.calibration.lane_width import LaneWidth, checks_by_lanes, painted_width_m
 from birdslam.calibration.readout import PRIOR
@@ -408,6 +416,43 @@ def test_a_bad_speed_file_is_named(tmp_path: Path, text: str) -> None:
     (tmp_path / "speed.txt").write_text(text)
     with pytest.raises(DatasetError, match=r"speed\.txt"):
         read_speed_curve(tmp_path / "speed.txt")
+
+
+def check_by_late_speed(lag_s: float, swing_mps: float, true_over_estimated: float) -> HeightCheck:
+    """40 s at 10 Hz; the readings of a speed of 10 m/s that swings over 9 s are late and have noise."""
+    t_s = np.arange(400) * 0.1
+    rng = np.random.default_rng(1)
+
+    def way_m(at_s: np.ndarray) -> np.ndarray:
+        return 10.0 * at_s - swing_mps * 9.0 / (2.0 * np.pi) * np.cos(2.0 * np.pi * at_s / 9.0)
+
+    read_s = np.arange(-5.0, 50.0, 0.1)
+    read_m = way_m(read_s - lag_s) + rng.normal(0.0, 0.02, len(read_s))
+    steps = [(k, k + 1, float(np.diff(way_m(t_s[k : k + 2]))[0]) / true_over_estimated) for k in range(399)]
+
+    def known(start: int, end: int, start_ns: int, end_ns: int) -> float | None:
+        ends_s = np.array([start_ns, end_ns]) * 1e-9
+        if ends_s.max() > t_s[-1]:
+            return None
+        return float(np.diff(np.interp(ends_s, read_s, read_m))[0])
+
+    times_ns = {k: round(at_s * 1e9) for k, at_s in enumerate(t_s)}
+    (check,) = checks_by_length({SPEED: known}, steps, times_ns, CAMERA, HeightCheckConfig())
+    return check
+
+
+@given(st.floats(0.0, 3.8), st.floats(0.8, 1.2))
+def test_the_lag_of_a_speed_is_estimated(lag_s: float, true_over_estimated: float) -> None:
+    check = check_by_late_speed(lag_s, 4.0, true_over_estimated)
+    assert abs(check.lag_s - lag_s) < max(0.2, 3.0 * check.lag_sigma_s)
+    assert check.lag_sigma_s < 0.5
+    assert check.height_m == pytest.approx(CAMERA.height_m * true_over_estimated, rel=0.01)
+
+
+def test_a_constant_speed_shows_no_lag() -> None:
+    check = check_by_late_speed(2.0, 0.0, 1.1)
+    assert check.lag_sigma_s > 0.8
+    assert check.height_m == pytest.approx(CAMERA.height_m * 1.1, rel=0.01)
 
 
 def calibrated(height_m: float, said: tuple[HeightCheck, ...], speed_mps: float = 0.0) -> Calibration:

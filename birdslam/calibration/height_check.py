@@ -25,8 +25,11 @@ from birdslam.road_users.camera_height import (
     marginalise_own_errors,
     own_variance,
 )
+from birdslam.types import NS_PER_S
 
 VEHICLES, LANES, KNOWN_VEHICLE = "vehicles", "lanes", "known vehicle"  # cues by size
+SPEED = "speed"  # cue by a file of speeds
+_LAGS_S = np.linspace(0.0, 4.0, 41)  # of a speed behind the images: receivers filter their speed
 _MIN_SIGMA_REL = 1e-3  # of a stated height
 _KNOWN_SIGMA_REL = 0.03  # of the height from a vehicle of known size: boxes are a few per cent too large or too small
 Floats = NDArray[np.float64]
@@ -61,6 +64,8 @@ class HeightCheck(msgspec.Struct, frozen=True, kw_only=True):
     height_m: float
     sigma_m: float
     samples: int
+    lag_s: float = 0.0  # of a speed behind the images
+    lag_sigma_s: float = 0.0  # its 1-sigma
 
 
 @dataclass(frozen=True)
@@ -184,22 +189,49 @@ def _by_length(
     camera: Camera,
     config: HeightCheckConfig,
 ) -> HeightCheck | None:
-    """All lengths of the odometry are proportional to the camera's height, and so are their errors."""
-    ratios, weights = [], []
+    """All lengths of the odometry are proportional to the camera's height, and so are their errors.
+
+    The lag of a speed is marginalized: its likelihood is that of the scatter of the ratios of lengths.
+    """
+    lags_s = _LAGS_S if cue == SPEED else np.zeros(1)
+    found = []
+    for lag_s in lags_s:
+        log_ratios, weights = _log_ratios(known, steps, times_ns, round(lag_s * NS_PER_S), config.section_m)
+        if len(log_ratios) < 2:
+            return None
+        mean = float(np.average(log_ratios, weights=weights))
+        found.append((mean, float(np.average((log_ratios - mean) ** 2, weights=weights)), len(log_ratios)))
+    means, variances, counts = np.array(found).T
+    spread = variances + config.sigma_scale_rel**2
+    # Neighbouring sections share readings: half of them count
+    likelihood = np.exp(-0.25 * counts.min() * np.log(spread / spread.min()))
+    weight = likelihood / likelihood.sum()
+    mean, lag_s = float(weight @ means), float(weight @ lags_s)
+    var = float(weight @ (variances / (counts - 1.0) + (means - mean) ** 2)) + config.sigma_scale_rel**2
+    height_m = camera.height_m * math.exp(mean)
+    return HeightCheck(
+        cue=cue,
+        height_m=height_m,
+        sigma_m=height_m * math.sqrt(var),
+        samples=round(float(weight @ counts)),
+        lag_s=lag_s,
+        lag_sigma_s=math.sqrt(float(weight @ (lags_s - lag_s) ** 2)),
+    )
+
+
+def _log_ratios(
+    known: KnownLength, steps: Sequence[Step], times_ns: dict[int, int], lag_ns: int, section_m: float
+) -> tuple[Floats, Floats]:
+    """Logs of known over estimated lengths of sections, and the estimated lengths; readings are `lag_ns` late."""
+    log_ratios, weights = [], []
     estimated_m = true_m = 0.0
     for start, end, length in steps:
-        truth = known(start, end, times_ns[start], times_ns[end])
+        truth = known(start, end, times_ns[start] + lag_ns, times_ns[end] + lag_ns)
         if truth is None:
             continue
         estimated_m, true_m = estimated_m + length, true_m + truth
-        if estimated_m > config.section_m:
-            ratios.append(np.log(max(true_m, 1e-3) / estimated_m))
+        if estimated_m > section_m:
+            log_ratios.append(math.log(max(true_m, 1e-3) / estimated_m))
             weights.append(estimated_m)
             estimated_m = true_m = 0.0
-    if len(ratios) < 2:
-        return None
-    mean = float(np.average(ratios, weights=weights))
-    scatter = float(np.sqrt(np.average((np.array(ratios) - mean) ** 2, weights=weights) / (len(ratios) - 1)))
-    sigma_rel = float(np.hypot(scatter, config.sigma_scale_rel))
-    height_m = camera.height_m * float(np.exp(mean))
-    return HeightCheck(cue=cue, height_m=height_m, sigma_m=height_m * sigma_rel, samples=len(ratios))
+    return np.array(log_ratios), np.array(weights)

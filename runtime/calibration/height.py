@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from birdslam.calibration.calibration import Calibration, CalibrationError
-from birdslam.calibration.height_check import KNOWN_VEHICLE, LANES, VEHICLES, HeightCheck, KnownLength
+from birdslam.calibration.height_check import KNOWN_VEHICLE, LANES, SPEED, VEHICLES, HeightCheck, KnownLength
 from birdslam.calibration.intrinsics import Intrinsics
 from birdslam.calibration.readout import Readout
 from birdslam.geometry.camera import Camera
@@ -53,7 +53,7 @@ def known_lengths(recording: Recording, speed_file: Path | None) -> dict[str, Kn
             return float(np.interp(end_ns * 1e-9, t_s, way_m) - np.interp(start_ns * 1e-9, t_s, way_m))
 
         check_times(recording, speed_file, round(t_s[0] * NS_PER_S), round(t_s[-1] * NS_PER_S))
-        out["speed"] = by_speed
+        out[SPEED] = by_speed
     return out
 
 

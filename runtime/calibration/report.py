@@ -59,7 +59,8 @@ def report(
         sigma_rel = check_sigma_rel(check)
         away = abs(math.log(check.height_m / camera.height_m)) / sigma_rel
         verdict = "agrees" if away < AGREES_SIGMA else f"DISAGREES ({away:.1f} sigma)"
-        yield f"  by {check.cue}: {check.height_m:.2f} m +- {sigma_rel:.0%} (of {check.samples}): {verdict}"
+        lag = f", {check.lag_s:.1f} +- {check.lag_sigma_s:.1f} s behind the images" if check.lag_sigma_s else ""
+        yield f"  by {check.cue}: {check.height_m:.2f} m +- {sigma_rel:.0%} (of {check.samples}{lag}): {verdict}"
     if not found.height_checks:
         yield "  not checked: no poses, no speed, and too few vehicles and lane markings"
 
