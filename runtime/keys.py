@@ -51,7 +51,6 @@ GROUPS = (
             "camera.distortion": "OpenCV distortion k1, k2, p1, p2[, k3[, k4, k5, k6]]; none: undistorted images",
             "camera.readout_s": "Readout time from the first to the last row; 0: global shutter",
             "camera.scale_sigma_rel": "1-sigma of all lengths due to height and focal length, a fraction; 0: measured",
-            "camera.distortion_sigma": "1-sigma of k1; its error lets the scale drift; 0: measured",
             "camera.fisheye": "The distortion is k1, k2, k3, k4 of an equidistant fisheye lens",
             "camera_sha256": 'SHA-256 that the camera file must have; "": any',
             "slam.frontend.odometry.start.camera_ahead_m": "Distance of the camera ahead of the rear axle",
