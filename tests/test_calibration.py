@@ -43,7 +43,8 @@ from birdslam.odometry.road.fit import RoadFit
 from birdslam.outputs.plain_words import DriveCounts, LengthsBy, verdict
 from birdslam.perception import Perception, Ready
 from birdslam.road_users.camera_height import BoxHeight
-from birdslam.runtime.calibration.given import KnownSize, known_length_of
+from birdslam.ros.bag import BagTopics
+from birdslam.runtime.calibration.given import Given, KnownSize, known_length_of, lens_of
 from birdslam.runtime.calibration.height import check_sigma_rel, lengths_by, with_height
 from birdslam.runtime.cli.main import main
 from birdslam.runtime.configuration import ConfigurationError
@@ -418,8 +419,8 @@ def test_a_bad_speed_file_is_named(tmp_path: Path, text: str) -> None:
         read_speed_curve(tmp_path / "speed.txt")
 
 
-def check_by_late_speed(lag_s: float, swing_mps: float, true_over_estimated: float) -> HeightCheck:
-    """40 s at 10 Hz; the readings of a speed of 10 m/s that swings over 9 s are late and have noise."""
+def check_by_late_speed(lag_s: float, swing_mps: float, true_over_estimated: float, end_s: float = 40.0) -> HeightCheck:
+    """40 s at 10 Hz; the readings of a speed of 10 m/s that swings over 9 s are late, have noise, and end."""
     t_s = np.arange(400) * 0.1
     rng = np.random.default_rng(1)
 
@@ -432,7 +433,7 @@ def check_by_late_speed(lag_s: float, swing_mps: float, true_over_estimated: flo
 
     def known(start: int, end: int, start_ns: int, end_ns: int) -> float | None:
         ends_s = np.array([start_ns, end_ns]) * 1e-9
-        if ends_s.max() > t_s[-1]:
+        if ends_s.max() > end_s:
             return None
         return float(np.diff(np.interp(ends_s, read_s, read_m))[0])
 
@@ -449,10 +450,26 @@ def test_the_lag_of_a_speed_is_estimated(lag_s: float, true_over_estimated: floa
     assert check.height_m == pytest.approx(CAMERA.height_m * true_over_estimated, rel=0.01)
 
 
+@pytest.mark.parametrize("end_s", [2.0, 3.0, 5.0])
+def test_a_short_file_of_speeds_still_gives_the_height(end_s: float) -> None:
+    """Only lags that the file covers are compared."""
+    check = check_by_late_speed(0.0, 0.0, 1.1, end_s)
+    assert check.height_m == pytest.approx(CAMERA.height_m * 1.1, rel=0.02)
+    assert check.lag_sigma_s > 0.0
+
+
 def test_a_constant_speed_shows_no_lag() -> None:
     check = check_by_late_speed(2.0, 0.0, 1.1)
     assert check.lag_sigma_s > 0.8
     assert check.height_m == pytest.approx(CAMERA.height_m * 1.1, rel=0.01)
+
+
+def test_an_earlier_camera_file_keeps_the_sigma_of_its_distortion(tmp_path: Path) -> None:
+    path = tmp_path / "camera.toml"
+    path.write_text(camera_text(msgspec.structs.replace(CAMERA, distortion_sigma=0.05), ()))
+    lens, _ = lens_of(Given(camera=path), "demo", BagTopics())
+    assert lens is not None
+    assert lens.distortion_sigma == 0.05
 
 
 def calibrated(height_m: float, said: tuple[HeightCheck, ...], speed_mps: float = 0.0) -> Calibration:

@@ -30,6 +30,7 @@ from birdslam.types import NS_PER_S
 VEHICLES, LANES, KNOWN_VEHICLE = "vehicles", "lanes", "known vehicle"  # cues by size
 SPEED = "speed"  # cue by a file of speeds
 _LAGS_S = np.linspace(0.0, 4.0, 41)  # of a speed behind the images: receivers filter their speed
+_MIN_SECTIONS = 2  # for a scatter
 _MIN_SIGMA_REL = 1e-3  # of a stated height
 _KNOWN_SIGMA_REL = 0.03  # of the height from a vehicle of known size: boxes are a few per cent too large or too small
 Floats = NDArray[np.float64]
@@ -193,45 +194,51 @@ def _by_length(
 
     The lag of a speed is marginalized: its likelihood is that of the scatter of the ratios of lengths.
     """
+    sections = _sections(steps, config.section_m)
     lags_s = _LAGS_S if cue == SPEED else np.zeros(1)
-    found = []
-    for lag_s in lags_s:
-        log_ratios, weights = _log_ratios(known, steps, times_ns, round(lag_s * NS_PER_S), config.section_m)
-        if len(log_ratios) < 2:
-            return None
-        mean = float(np.average(log_ratios, weights=weights))
-        found.append((mean, float(np.average((log_ratios - mean) ** 2, weights=weights)), len(log_ratios)))
-    means, variances, counts = np.array(found).T
+    known_m = np.array([[_known_m(known, times_ns, each, lag_s) for each in sections] for lag_s in lags_s])
+    # Lags are compared over the same sections: those at lag 0 that the other lags cover, too
+    covered = np.isfinite(known_m) & np.isfinite(known_m[0])
+    kept = covered.sum(axis=1) >= max(_MIN_SECTIONS, 0.5 * covered[0].sum())
+    if not kept[0]:
+        return None
+    common = covered[kept].all(axis=0)
+    estimated_m = np.array([sum(length for *_, length in each) for each in sections])[common]
+    log_ratios, lags_s = np.log(np.maximum(known_m[kept][:, common], 1e-3) / estimated_m), lags_s[kept]
+    count = len(estimated_m)
+    means = np.average(log_ratios, axis=1, weights=estimated_m)
+    variances = np.average((log_ratios - means[:, None]) ** 2, axis=1, weights=estimated_m)
     spread = variances + config.sigma_scale_rel**2
     # Neighbouring sections share readings: half of them count
-    likelihood = np.exp(-0.25 * counts.min() * np.log(spread / spread.min()))
+    likelihood = np.power(spread.min() / spread, 0.25 * count)
     weight = likelihood / likelihood.sum()
     mean, lag_s = float(weight @ means), float(weight @ lags_s)
-    var = float(weight @ (variances / (counts - 1.0) + (means - mean) ** 2)) + config.sigma_scale_rel**2
+    var = float(weight @ (variances / (count - 1) + (means - mean) ** 2)) + config.sigma_scale_rel**2
     height_m = camera.height_m * math.exp(mean)
     return HeightCheck(
         cue=cue,
         height_m=height_m,
         sigma_m=height_m * math.sqrt(var),
-        samples=round(float(weight @ counts)),
+        samples=count,
         lag_s=lag_s,
         lag_sigma_s=math.sqrt(float(weight @ (lags_s - lag_s) ** 2)),
     )
 
 
-def _log_ratios(
-    known: KnownLength, steps: Sequence[Step], times_ns: dict[int, int], lag_ns: int, section_m: float
-) -> tuple[Floats, Floats]:
-    """Logs of known over estimated lengths of sections, and the estimated lengths; readings are `lag_ns` late."""
-    log_ratios, weights = [], []
-    estimated_m = true_m = 0.0
-    for start, end, length in steps:
-        truth = known(start, end, times_ns[start] + lag_ns, times_ns[end] + lag_ns)
-        if truth is None:
-            continue
-        estimated_m, true_m = estimated_m + length, true_m + truth
+def _sections(steps: Sequence[Step], section_m: float) -> list[list[Step]]:
+    """Consecutive steps of more than `section_m` together; without an incomplete last section."""
+    out, section, estimated_m = [], list[Step](), 0.0
+    for step in steps:
+        section.append(step)
+        estimated_m += step[2]
         if estimated_m > section_m:
-            log_ratios.append(math.log(max(true_m, 1e-3) / estimated_m))
-            weights.append(estimated_m)
-            estimated_m = true_m = 0.0
-    return np.array(log_ratios), np.array(weights)
+            out.append(section)
+            section, estimated_m = [], 0.0
+    return out
+
+
+def _known_m(known: KnownLength, times_ns: dict[int, int], section: Sequence[Step], lag_s: float) -> float:
+    """Known length of a section if readings are `lag_s` late; NaN if it is not known for each step."""
+    lag_ns = round(lag_s * NS_PER_S)
+    each = [known(start, end, times_ns[start] + lag_ns, times_ns[end] + lag_ns) for start, end, _ in section]
+    return sum(math.nan if length is None else length for length in each)

@@ -40,6 +40,7 @@ class Intrinsics(msgspec.Struct, frozen=True, kw_only=True):
     source: str = ""
     reprojection_px: float | None = None  # RMS of a chessboard's corners
     sigma_focal_px: float | None = None
+    distortion_sigma: float = 0.0  # 1-sigma of k1; 0: it was measured
     left_out: tuple[str, ...] = ()  # unused images with the reason
 
     def for_size(self, width_px: int, height_px: int) -> Intrinsics:

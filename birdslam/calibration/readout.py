@@ -45,7 +45,6 @@ def readout_of_drive(
     images: Sequence[CornersOfImage],
     camera: Camera,
     focal_sigma_rel: float = 0.0,
-    k1_sigma: float = 0.0,
 ) -> Readout:
     """Readout time from corners of raw images and a camera with this lens uncertainty; PRIOR without evidence.
 
@@ -57,7 +56,7 @@ def readout_of_drive(
         replace(window, px=focal_px * _undistorted(window.px + middle, camera))
         for window in select_near_windows(images, middle, focal_px)
     ]
-    k1 = 0.0, max(k1_sigma, MIN_SIGMA_K1)
+    k1 = 0.0, max(camera.distortion_sigma, MIN_SIGMA_K1)
     started = initialize(windows, focal_px, 0.0, SIGMA_PX * focal_px / FOCAL_PX, False, k1, (0.0, _INITIAL_SIGMA_S))
     if started is None:
         return PRIOR

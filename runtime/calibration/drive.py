@@ -71,20 +71,18 @@ def calibrate_drive(
     is_film = parsed(uri)[0].camera in ("frame size", "nothing")
     pitch: TravelPitch | None = None
     corners: list[CornersOfImage] | None = None
-    k1_sigma = 0.0
     if lens is None and size is not None and is_film:
-        lens, corners, k1_sigma, pitch = lens_of_drive(configuration, uri, given, size, stride, must_show)
+        lens, corners, pitch = lens_of_drive(configuration, uri, given, size, stride, must_show)
     if lens is not None and size is not None:
         lens = lens.for_size(*size)
     recording, every = _open_slowly(uri, lens, height_m, stride, topics)
     if pitch is not None:
         recording.camera = msgspec.structs.replace(recording.camera, pitch_rad=pitch.pitch_rad)
-    recording.camera = msgspec.structs.replace(recording.camera, distortion_sigma=k1_sigma)
     readout: Readout | None = None
     # In a portrait video the rows of the sensor are columns of the image
     if is_film and recording.camera.width_px >= recording.camera.height_px:
         corners = corners or corners_of_drive(configuration, uri, recording.camera, stride)
-        readout = readout_of_drive(corners, recording.camera, focal_sigma_rel(lens), k1_sigma)
+        readout = readout_of_drive(corners, recording.camera, focal_sigma_rel(lens))
         recording.camera = msgspec.structs.replace(recording.camera, readout_s=readout.readout_s)
     most_frames = None if configuration.source.frames is None else max(1, configuration.source.frames // every)
     known_height = height_m is not None or lens is None  # a recording with its own calibration has the height
@@ -168,6 +166,7 @@ def _open(uri: str, lens: Intrinsics | None, height_m: float | None, stride: int
             height_m=height_m or UNKNOWN_HEIGHT_M,
             distortion=lens.distortion,
             fisheye=lens.fisheye,
+            distortion_sigma=lens.distortion_sigma,
         )
     except ValueError as error:
         raise DatasetError(f"{lens.source}: {error}") from None

@@ -77,7 +77,8 @@ def lens_of(given: Given, uri: str, topics: BagTopics) -> tuple[Intrinsics | Non
         raise ConfigurationError(f"--height {height_m:g}: expected 0.2 to 5 m above the road")
     if given.camera is not None:
         old = load_camera(given.camera)
-        numbers = {name: getattr(old, name) for name in ("fx_px", "fy_px", "cx_px", "cy_px", "distortion", "fisheye")}
+        names = ("fx_px", "fy_px", "cx_px", "cy_px", "distortion", "fisheye", "distortion_sigma")
+        numbers = {name: getattr(old, name) for name in names}
         lens = Intrinsics(**numbers, width_px=old.width_px, height_px=old.height_px, source=str(given.camera))
         return lens, height_m or old.height_m
     if given.intrinsics is not None:

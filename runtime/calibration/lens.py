@@ -33,11 +33,10 @@ from birdslam.types import NS_PER_S
 
 
 class LensOfDrive(NamedTuple):
-    """A lens, the corners behind it, 1-sigma of its k1, and the pitch from the direction of travel if observable."""
+    """A lens, the corners behind it, and the pitch from the direction of travel if observable."""
 
     lens: Intrinsics
     corners: list[CornersOfImage]
-    k1_sigma: float
     pitch: TravelPitch | None = None
 
 
@@ -77,8 +76,9 @@ def lens_of_drive(
             source=f"assumed, not determined by the drive: focal length {focal_px:.0f} px +- {sigma_rel:.0%}, "
             f"{by}; {shape}",
             sigma_focal_px=focal_px * sigma_rel,
+            distortion_sigma=SIGMA_K1,
         )
-        return LensOfDrive(assumed, corners, SIGMA_K1)
+        return LensOfDrive(assumed, corners)
     if lens is None:
         raise CalibrationError(
             f"{uri}: its images do not determine the lens: the car hardly moves in the {READ_S:g} s that are read, or "
@@ -101,8 +101,9 @@ def lens_of_drive(
             f"(of {lens.windows} windows, {np.degrees(lens.turned_rad):.0f} deg turned{lines})"
         ),
         sigma_focal_px=lens.focal_px * lens.focal_sigma_rel,
+        distortion_sigma=lens.k1_sigma,
     )
-    return LensOfDrive(found, corners, lens.k1_sigma, lens.pitch)
+    return LensOfDrive(found, corners, lens.pitch)
 
 
 def corners_of_drive(
