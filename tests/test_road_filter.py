@@ -216,6 +216,16 @@ def test_weak_comparison_counts_with_two_agreeing_ones() -> None:
     assert not confirmation.was_found_before(3.45)
 
 
+def test_each_alignment_without_information_tries_another_baseline() -> None:
+    confirmation = ScaleConfirmation(RoadScaleConfig())
+    confirmation.reject(1.0)
+    confirmation.add_accepted(0.1)
+    confirmation.add_accepted(0.0)
+    assert confirmation.uninformative == 3
+    confirmation.add_accepted(0.9)
+    assert confirmation.uninformative == 0
+
+
 def test_known_scale_yields_to_two_agreeing_searches() -> None:
     """The town film at half size from its 13th second on grew by 30 % at one comparison that correlated by .33."""
     confirmation = ScaleConfirmation(RoadScaleConfig())

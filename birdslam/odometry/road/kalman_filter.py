@@ -48,9 +48,7 @@ class RoadFilter:
         self.x = np.array([0.0, camera.pitch_rad, camera.roll_rad, 0.0, camera.pitch_rad, camera.roll_rad, 0.0])
         mount, tilt = config.sigma_mount_rad**2, config.sigma_mount_rad**2 + config.sigma_bounce_rad**2
         self._drift_var = config.scale_drift_per_m**2 + _distortion_drift_per_m(camera) ** 2
-        self.cov: Floats = np.diag(
-            [1.0, tilt, tilt, config.sigma_curvature_per_m**2, mount, mount, self._drift_var]
-        )
+        self.cov: Floats = np.diag([1.0, tilt, tilt, config.sigma_curvature_per_m**2, mount, mount, self._drift_var])
         self.cov[[1, 2, 4, 5], [4, 5, 1, 2]] = mount
         self.pending_log = 0.0  # correction of log lambda that the caller has yet to apply
         self.carried_m = 0.0  # travelled without information on the length; each alignment reduces it
