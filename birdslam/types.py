@@ -478,7 +478,7 @@ class Ground(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class FollowedPerson(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False):
-    """A person or cyclist in one frame, tracked by the front end's filter (road_users/people/).
+    """A person or cyclist in one frame, tracked by the front end's filter (road_users/models/).
 
     Position and velocity over the ground are in the axes of this frame's ego. People are filtered outside the graph,
     which transforms them to world.

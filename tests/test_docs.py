@@ -86,7 +86,7 @@ def test_every_estimate_of_a_vehicle_has_an_owner_an_equation_and_a_reader() -> 
         assert all(row[column] for column in ("state and covariance", "measured by", "equation", "read by")), row
     owners = " ".join(in_the_code(row)[0] for row in estimates)
     with_rows = [path.stem for path in (ROOT / "birdslam").rglob("*.py") if "def keep_rows" in path.read_text()]
-    assert {"parallax", "ground_size_filter"} <= {*with_rows}
+    assert {"user_filter", "ground_size_filter"} <= {*with_rows}
     assert all(f".{name}." in owners for name in with_rows if name != "track")
 
 

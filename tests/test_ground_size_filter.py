@@ -9,6 +9,7 @@ from msgspec.structs import replace
 
 from birdslam.geometry.camera import PLANE_AT_M, GroundPlane, VerticalCurvature
 from birdslam.geometry.se2 import SE2
+from birdslam.road_users.models.user_filter import GrownSize
 from birdslam.road_users.placement.localisation import (
     LocalisationConfig,
     Observation,
@@ -18,12 +19,10 @@ from birdslam.road_users.placement.localisation import (
 from birdslam.road_users.state.ground_measurements import COMMON
 from birdslam.road_users.state.ground_size_config import GroundSizeConfig
 from birdslam.road_users.state.ground_size_filter import GroundSizeFilter, estimate_curvature
-from birdslam.road_users.state.parallax import LearnedSize
 from tests.boxes import CAR, cuboid_px, footprint_m
 from tests.recordings import KITTI as CAMERA
 
 LOCALISATION = LocalisationConfig()
-NO_OUTLIERS = np.zeros((1, 2))
 IMAGE_COV = np.diag([0.001, 0.002]) ** 2
 CONFIG = GroundSizeConfig(roof_reach_rel=1.0)  # the world here is made of cuboids
 
@@ -232,9 +231,8 @@ def test_external_size_corrects_depth_and_is_not_stored() -> None:
     seen = observe_boxes(box[0][None], np.ones(1), ("car",), CAMERA, road.ground_size.ground, LOCALISATION)
     extents = np.array([extent_m(CAR, 0.0, o.depth_by_height_m, o.bearing) for o in seen])
 
-    def again(weights: list[float], heights_m: list[float], sigma: float) -> tuple[float, float]:
-        variances = np.full((1, len(weights)), sigma**2)
-        learned = LearnedSize(np.array([weights]), np.log([heights_m]), variances, np.zeros(1), NO_OUTLIERS)
+    def again(stationary: float, sigma: float) -> tuple[float, float]:
+        learned = GrownSize(np.log([1.7]), np.array([sigma**2]), np.array([stationary]), np.zeros(1))
         ground_size = copy.deepcopy(road.ground_size)
         found = ground_size.estimate_depths([0], seen, extents[:, 1], extents[:, 0], np.zeros(1), learned)
         assert ground_size.size(0)[0] < 1.62
@@ -245,12 +243,12 @@ def test_external_size_corrects_depth_and_is_not_stored() -> None:
         return depth_m, float(np.sqrt(found.variance[0]))
 
     truth_m = 40.0 - CAR.length_m / 2.0
-    told_m, told_sigma = again([1.0], [1.7], 0.001)
+    told_m, told_sigma = again(1.0, 0.001)
     assert abs(told_m - truth_m) < 0.3 * abs(prior_m - truth_m)
     assert told_sigma < prior_sigma
-    vague_m, _ = again([1.0], [1.7], 1e3)
-    mixed_m, mixed_sigma = again([0.5, 0.5], [1.4, 1.7], 0.001)
-    assert again([1.0, 0.0], [1.7, 1.2], 0.001)[0] == pytest.approx(told_m)
+    vague_m, _ = again(1.0, 1e3)
+    mixed_m, mixed_sigma = again(0.5, 0.001)
+    assert again(0.0, 0.001)[0] == pytest.approx(prior_m, rel=0.02)
     assert abs(vague_m - prior_m) < 0.1 * abs(told_m - prior_m)
     assert mixed_m < told_m
     assert mixed_sigma > 1.5 * told_sigma
@@ -260,9 +258,7 @@ def test_external_size_corrects_depth_and_is_not_stored() -> None:
 def test_widening_box_means_turning_or_approaching_car(speed_mps: float) -> None:
     """The aspect of a stationary vehicle changes only by ego-motion, so its width counts; a moving one may turn."""
     road = Road()
-    motion = LearnedSize(
-        np.ones((1, 1)), np.full((1, 1), math.log(1.53)), np.full((1, 1), 1e6), np.full(1, speed_mps), NO_OUTLIERS
-    )
+    motion = GrownSize(np.full(1, math.log(1.53)), np.full(1, 1e6), np.ones(1), np.full(1, speed_mps))
     cuboid = road.box(30.0, 0.0, 1.53)
     for k in range(40):
         half_px = (cuboid[2] - cuboid[0]) / 2.0 * max(0.0, 0.025 * (k - 10))

@@ -104,7 +104,7 @@ def test_parked_car_with_a_neighbours_box_stays_stationary(leap_m: tuple[float, 
         box = box_of(x_m, 3.8, CAMERA.ground, CAR.height_m)[None]
         frame = EgoFrame(k, round(k * DT_S * 1e9), SE2(0.8 * k, 0.0, 0.0), np.diag([1e-4, 1e-4, 1e-8]))
         tracker.update(frame, observe_boxes(box, np.ones(1), ("car",), CAMERA, ground_size.ground, LOCALISATION))
-        standing.append(tracker.placing.parallax.stationary_probability(0))
+        standing.append(tracker.placing.users.stationary_probability()[0])
     assert len(tracker.tracks) == 1  # it is one track: the box leapt within the gate
     assert min(standing[10:]) > 0.3
     assert standing[-1] > 0.8
@@ -118,4 +118,4 @@ def test_departing_car_keeps_its_track() -> None:
         box = box_of(20.0 + 0.4 * k, 3.8, CAMERA.ground, CAR.height_m)[None]
         frame = EgoFrame(k, round(k * DT_S * 1e9), SE2(0.8 * k, 0.0, 0.0), np.diag([1e-4, 1e-4, 1e-8]))
         tracker.update(frame, observe_boxes(box, np.ones(1), ("car",), CAMERA, ground_size.ground, LOCALISATION))
-    assert tracker.placing.parallax.stationary_probability(0) < 0.1
+    assert tracker.placing.users.stationary_probability()[0] < 0.1

@@ -15,7 +15,6 @@ from birdslam.road_users.placement.uncertain_yaw import HeadingConfig
 from birdslam.road_users.placing import Assignment, Placing, truncate_at_cut
 from birdslam.road_users.state.ground_size_config import GroundSizeConfig
 from birdslam.road_users.state.ground_size_filter import Depths, GroundSizeFilter
-from birdslam.road_users.state.parallax_config import ParallaxConfig
 from tests.boxes import CAR, cuboid_px, footprint_m
 from tests.test_frontend import CAMERA
 
@@ -74,7 +73,7 @@ def test_cars_beside_the_ego_are_not_placed_far_ahead() -> None:
         for side in (-3.3, 3.3):
             for height_m in (1.4, 1.53, 1.66):
                 ground_size = GroundSizeFilter(CAMERA, GroundSizeConfig())
-                placing = Placing(ground_size, CONFIG, ParallaxConfig(), PseudoLidarConfig(), HeadingConfig())
+                placing = Placing(ground_size, CONFIG, PseudoLidarConfig(), HeadingConfig())
                 assignment = Assignment(0, None, seen_at(float(x_m), side, height_m))
                 assert assignment.observation.sigma_cut is not None
                 (where,) = placing.locate([assignment], SE2())

@@ -10,10 +10,10 @@ from birdslam.frontend import FrontEndConfig
 from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.perception import Detections
+from birdslam.road_users.models.user_filter import GrownSize
 from birdslam.road_users.placement.localisation import LocalisationConfig, extent_m, observe_boxes
 from birdslam.road_users.state.ground_size_config import GroundSizeConfig
 from birdslam.road_users.state.ground_size_filter import GroundSizeFilter
-from birdslam.road_users.state.parallax import LearnedSize
 from birdslam.sources.kitti_tracking import TrackingSequence
 from tests.boxes import CAR, car_px
 from tests.recordings import KITTI as CAMERA
@@ -38,9 +38,7 @@ def see(
     for new in seen[len(ground_size) :]:
         ground_size.add_vehicle(new)
     extents = np.array([extent_m(CAR, 0.0, o.depth_by_height_m, o.bearing) for o in seen]).reshape(-1, 2)
-    learned = LearnedSize(
-        np.ones((n, 1)), np.zeros((n, 1)), np.full((n, 1), 1e6), np.full(n, speed_mps), np.zeros((n, 2))
-    )
+    learned = GrownSize(np.zeros(n), np.full(n, 1e6), np.ones(n), np.full(n, speed_mps))
     depths = ground_size.estimate_depths(list(range(n)), seen, extents[:, 1], extents[:, 0], np.zeros(n), learned)
     return np.exp(depths.log_depth), np.sqrt(depths.variance)
 

@@ -206,7 +206,7 @@ def test_stationary_vehicle_keeps_its_yaw_while_size_is_estimated() -> None:
         tracks = drive.step(SE2(0.9 * k, 0.0, 0.0), [SE2(65.0, 4.0, 0.0)])
     (track,) = tracks
     assert track.is_stationary
-    assert drive.tracker.placing.parallax.stationary_probability(drive.tracker.tracks.index(track)) > 0.9
+    assert drive.tracker.placing.users.stationary_probability()[drive.tracker.tracks.index(track)] > 0.9
     assert track.yaw_rad == 0.0
     assert math.hypot(track.state[0] - 65.0, track.state[1] - 4.0) < 1.0
 
@@ -321,10 +321,10 @@ def test_each_filter_has_exactly_one_row_per_track() -> None:
         others = [SE2(15.0 + 9.0 * i, 3.5) for i in range(9) if (k // 7 + i) % 3]  # seen at times, some forgotten
         drive.step(ego, [*others, tall])
         tracker = drive.tracker
-        assert len(tracker.tracks) == len(tracker.placing.parallax) == len(tracker.ground_size)
+        assert len(tracker.tracks) == len(tracker.placing.users) == len(tracker.ground_size)
         for row, track in enumerate(tracker.tracks):
             if track.frame.frame_id == k and track.place.assumed is not None:
-                assert track.place.assumed.standing == tracker.placing.parallax.stationary_probability(row)
+                assert track.place.assumed.standing == tracker.placing.users.stationary_probability()[row]
 
 
 def test_lost_car_does_not_pass_its_id_to_a_parked_one() -> None:

@@ -27,7 +27,6 @@ from birdslam.road_users.placement.uncertain_yaw import HeadingConfig
 from birdslam.road_users.placing import Assignment, Placing
 from birdslam.road_users.state.ground_size_config import GroundSizeConfig
 from birdslam.road_users.state.ground_size_filter import GroundSizeFilter
-from birdslam.road_users.state.parallax_config import ParallaxConfig
 from tests.test_frontend import CAMERA
 
 CONFIG = LocalisationConfig()
@@ -100,7 +99,7 @@ def test_position_does_not_depend_on_the_lower_edge_type() -> None:
     face_m, found = 9.0, {}
     for lower_edge in ("body", "tyres"):
         ground_size = GroundSizeFilter(CAMERA, GroundSizeConfig())
-        placing = Placing(ground_size, CONFIG, ParallaxConfig(), PseudoLidarConfig(), HeadingConfig())
+        placing = Placing(ground_size, CONFIG, PseudoLidarConfig(), HeadingConfig())
         height_m = CAMERA.height_m
         observation = seen(height_m / face_m, lower_edge="body")
         if lower_edge == "tyres":

@@ -1,6 +1,6 @@
 """Decides whether vehicles are stationary or moving, and computes their reported velocity.
 
-Two probabilities of being stationary, that of the front end (road_users/state/parallax.py) and the Savage-Dickey
+Two probabilities of being stationary, that of the front end (road_users/models/user_filter.py) and the Savage-Dickey
 density ratio of the velocity of the graph, are pooled by the mean log odds (Genest and Zidek 1986). The decision has
 hysteresis; the velocity has the covariance of a mixture. docs/method.md ("Stationary or moving") has the equations.
 """
@@ -16,7 +16,7 @@ from birdslam.geometry.arrays import Complexes, Floats
 from birdslam.graph.vehicles import VehicleNode
 from birdslam.types import Moves
 
-PRIOR = 1.0 / 3.0  # probability that a new vehicle is stationary, as in parallax.py
+PRIOR = 1.0 / 3.0  # probability that a new vehicle is stationary, as in vehicle_boxes.py
 PRIOR_BESIDE = 0.75  # the same for vehicles first seen more than 15 m aside, from labels of KITTI tracking
 MAX_PROBABILITY = 0.99  # limit of either probability, and 1 minus it
 DECIDED, GIVEN_UP = 0.9, 0.7  # probabilities at which a decision is made, and revoked; by judgement

@@ -14,7 +14,7 @@ from birdslam.graph.edges import CvEdges, PoseEdges, VvEdges
 from birdslam.graph.factors.lasting_error import line_of_sight_factor
 from birdslam.types import Moves, VehicleEdge
 
-PATH_HALF_WIDTH_M = 1.75  # half a lane, as in road_users/state/parallax.py
+PATH_HALF_WIDTH_M = 1.75  # half a lane
 BESIDE_M = 15.0  # vehicles at a larger lateral distance are on another road or parked: standing.py
 MAX_LOG_HEIGHT = 2.0  # of a vehicle
 MIN_DISTANCE_M = 1e-9  # of a vehicle from the ego

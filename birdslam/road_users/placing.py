@@ -1,6 +1,6 @@
 """Places of all vehicles of a frame from every measurement of depth.
 
-Sizes by parallax (parallax.py), Eq. 1 on all boxes with one road (ground_size_filter.py), the uncertain yaw
+Sizes by growth (models/user_filter.py), Eq. 1 on all boxes with one road (ground_size_filter.py), the uncertain yaw
 (uncertain_yaw.py), and the depth map if there is one (pseudolidar.py). Add a new source of places to `Placing.locate`,
 a new filter to `Placing._add_vehicles`.
 """
@@ -16,8 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry import bev
+from birdslam.geometry.bev import RoadProfile
 from birdslam.geometry.se2 import SE2, wrap
 from birdslam.road_users.association import in_ego
+from birdslam.road_users.models.user_boxes import Boxes
+from birdslam.road_users.models.user_filter import GrownSize, UserFilter
 from birdslam.road_users.placement.depth_fusion import DepthPlace, PseudoLidarConfig, fuse
 from birdslam.road_users.placement.localisation import (
     MIN_DISTANCE_M,
@@ -38,10 +41,15 @@ from birdslam.road_users.placement.uncertain_yaw import (
     make_fan,
     weigh_yaws,
 )
+from birdslam.road_users.placement.vehicle_boxes import (
+    KINDS,
+    SIGMA_ODD_REL,
+    SIGMA_SCALE_REL,
+    SIGMA_SIDE_OUTLIER_REL,
+    measure_boxes,
+    vehicle_kinds,
+)
 from birdslam.road_users.state.ground_size_filter import Depths, GroundSizeFilter
-from birdslam.road_users.state.parallax import LearnedSize, Parallax
-from birdslam.road_users.state.parallax_config import SIGMA_SIDE_OUTLIER_REL, ParallaxConfig
-from birdslam.road_users.state.parallax_measurements import measure_boxes
 from birdslam.road_users.state.yaw_by_outline import YawByOutline
 from birdslam.road_users.track import VehicleTrack
 
@@ -112,15 +120,14 @@ class _Prediction:
 class Placing:
     """Calls per frame: predict(), then locate().
 
-    Its state is that of its filters, `Parallax`, `GroundSizeFilter` and `YawByOutline`. Readers: the tracker for places
-    (m, with covariances), the smoother for the assumed sizes.
+    Its state is that of its filters, `UserFilter`, `GroundSizeFilter` and `YawByOutline`. Readers: the tracker for
+    places (m, with covariances), the smoother for the assumed sizes.
     """
 
     def __init__(
         self,
         ground_size: GroundSizeFilter,
         localisation: LocalisationConfig,
-        parallax: ParallaxConfig,
         pseudolidar: PseudoLidarConfig,
         heading: HeadingConfig,
     ) -> None:
@@ -130,22 +137,24 @@ class Placing:
         self.localisation = localisation
         self.heading = heading
         self.pseudolidar = pseudolidar
-        self.parallax = Parallax(parallax)
+        self.users = UserFilter(KINDS)
         self.yaw_by_outline = YawByOutline(heading)
 
     def predict(self, dt_s: float, T_world_ego: SE2, step_cov: Floats | None) -> None:
         """Predicts to the ego pose of the next frame; `step_cov` (3, 3) is the covariance of the step."""
-        self.parallax.predict(dt_s, T_world_ego, step_cov)
+        self.users.predict(dt_s, T_world_ego, step_cov, self.ground_size.step)
         self.yaw_by_outline.predict(dt_s, T_world_ego)
 
     def locate(self, assignments: Sequence[Assignment], T_world_ego: SE2) -> list[Place]:
         """Returns one place in ego per assignment; updates the tilt of the road and the sizes."""
         assignments = self._with_face_bottoms(assignments, T_world_ego)
         expected = self._expected(assignments, T_world_ego)
-        self._add_vehicles(assignments, expected, T_world_ego)
-        sizes = self._sizes_by_parallax(assignments, expected, T_world_ego)
-        assignments = self._with_side_outliers(assignments, sizes)
+        boxes = self._measure(assignments, expected, T_world_ego)
+        self._add_vehicles(assignments, expected, boxes, T_world_ego)
+        sizes, outlier = self._sizes_by_growth(assignments, boxes, T_world_ego)
+        assignments = self._with_side_outliers(assignments, outlier)
         depths = _depths_by_eq_1(assignments, expected, sizes, self.ground_size)
+        self.users.set_common_priors(np.array([(0.0, self.ground_size.sigma_pitch_rad**2), (0.0, 0.0)]))
         by_eq_1 = self._places_at(depths, assignments, expected.yaw_rad, T_world_ego)
         # Fuse the two sources of Fig. 2
         fused = [fuse(where, a.by_depth, self.pseudolidar) for where, a in zip(by_eq_1, assignments, strict=True)]
@@ -176,32 +185,44 @@ class Placing:
             yaws, np.array(centres).reshape(-1, 2), np.array(extents).reshape(-1, 2), np.array(turned, dtype=np.float64)
         )
 
-    def _add_vehicles(self, assignments: Sequence[Assignment], expected: _Prediction, T_world_ego: SE2) -> None:
-        """Adds the new vehicles, each in the next row of every filter."""
-        for assignment, centre_m, yaw_rad in zip(assignments, expected.centre_m, expected.yaw_rad, strict=True):
-            if assignment.track is None:
-                d = assignment.observation.dimensions
-                sigmas = d.sigma_height_rel, d.sigma_width_rel
-                self.parallax.add_vehicle(centre_m, yaw_rad, T_world_ego, math.log(d.height_m), sigmas)
-                self.ground_size.add_vehicle(assignment.observation)
-                self.yaw_by_outline.add_vehicle()
-
-    def _sizes_by_parallax(
-        self, assignments: Sequence[Assignment], expected: _Prediction, T_world_ego: SE2
-    ) -> LearnedSize:
-        """Heights of the vehicles from the growth of their boxes in the image."""
+    def _measure(self, assignments: Sequence[Assignment], expected: _Prediction, T_world_ego: SE2) -> Boxes:
+        """The measurements of the boxes."""
         seen, height_m = [a.observation for a in assignments], self.ground_size.ground.height_m
-        above_roof_m = np.array([max(0.0, height_m - o.dimensions.height_m) for o in seen])
-        roof_m2 = above_roof_m * expected.extent_m[:, 0] * self.ground_size.config.roof_reach_rel
-        yaw_rad, vertical = np.array(expected.yaw_rad), self.ground_size.vertical_per_m
-        boxes = measure_boxes(
-            seen, expected.centre_m, expected.extent_m, expected.turned_rad, yaw_rad, roof_m2, vertical
-        )
-        return self.parallax.learn_sizes([a.row for a in assignments], boxes, T_world_ego, height_m)
+        is_below = np.array([height_m > o.dimensions.height_m for o in seen], dtype=np.bool_)
+        top_m = is_below * expected.extent_m[:, 0] * self.ground_size.config.roof_reach_rel
+        direction_rad = np.array(expected.yaw_rad) + T_world_ego.yaw_rad
+        return measure_boxes(seen, expected.centre_m, expected.extent_m, expected.turned_rad, direction_rad, top_m)
 
-    def _with_side_outliers(self, assignments: Sequence[Assignment], sizes: LearnedSize) -> list[Assignment]:
-        """Raises the sigmas of probable outlier sides of boxes."""
-        sigma_rel = SIGMA_SIDE_OUTLIER_REL * np.sqrt(sizes.side_outlier)
+    def _add_vehicles(
+        self, assignments: Sequence[Assignment], expected: _Prediction, boxes: Boxes, T_world_ego: SE2
+    ) -> None:
+        """Adds the new vehicles, each in the next row of every filter."""
+        new = [k for k, a in enumerate(assignments) if a.track is None]
+        if not new:
+            return
+        dimensions = [assignments[k].observation.dimensions for k in new]
+        heights = np.array([[(d.height_m, sigma) for sigma in (d.sigma_height_rel, SIGMA_ODD_REL)] for d in dimensions])
+        widths = np.array([d.sigma_width_rel for d in dimensions])
+        self.users.add(vehicle_kinds(expected.centre_m[new]), boxes.take(new), heights, widths, T_world_ego)
+        for k in new:
+            self.ground_size.add_vehicle(assignments[k].observation)
+            self.yaw_by_outline.add_vehicle()
+
+    def _sizes_by_growth(
+        self, assignments: Sequence[Assignment], boxes: Boxes, T_world_ego: SE2
+    ) -> tuple[GrownSize | None, Floats]:
+        """Heights of the vehicles from the growth of their boxes, and probabilities (N, 2) of outlying sides."""
+        rows, road = [a.row for a in assignments], self.ground_size
+        if not rows:
+            return None, np.zeros((0, 2))
+        profile = RoadProfile(road.ground.height_m, road.vertical_per_m)
+        cases = self.users.correct(rows, boxes, T_world_ego, profile)
+        sizes = self.users.sizes_by_growth(rows)
+        return replace(sizes, variance=sizes.variance + boxes.face_var + SIGMA_SCALE_REL**2), cases[:, 1:3]
+
+    def _with_side_outliers(self, assignments: Sequence[Assignment], outlier: Floats) -> list[Assignment]:
+        """Raises the sigmas of probable outlier sides of boxes, with probabilities (N, 2)."""
+        sigma_rel = SIGMA_SIDE_OUTLIER_REL * np.sqrt(outlier)
         out = []
         for a, (left_rel, right_rel) in zip(assignments, sigma_rel.tolist(), strict=True):
             seen = a.observation
@@ -248,12 +269,12 @@ class Placing:
             log_height=float(depths.log_height[k]),
             sigma_log_height=math.sqrt(float(depths.height_variance[k])),
             depth_per_height=float(depths.depth_per_height[k]) * min(share, 1.0),
-            standing=self.parallax.stationary_probability(row),
+            standing=float(self.users.stationary_probability()[row]),
         )
 
 
 def _depths_by_eq_1(
-    assignments: Sequence[Assignment], expected: _Prediction, sizes: LearnedSize, ground_size: GroundSizeFilter
+    assignments: Sequence[Assignment], expected: _Prediction, sizes: GrownSize | None, ground_size: GroundSizeFilter
 ) -> Depths:
     """Depths (N,) of the nearest faces, from all boxes with one road."""
     seen, rows = [a.observation for a in assignments], [a.row for a in assignments]

@@ -137,7 +137,7 @@ def _log_height(seen: Sequence[VehicleMeasurement]) -> float:
     """Log height of a vehicle from all frames.
 
     Each frame is weighted by its information beyond the first frame, which has the prior of the class. The last frame
-    is not always the best: the height by parallax is not kept, and a leaving vehicle is cut or far.
+    is not always the best: the height by growth is not kept, and a leaving vehicle is cut or far.
     """
     log_height = np.array([one.edge.log_height for one in seen])
     information = np.array([max(one.edge.sigma_log_height, MIN_SIGMA_LOG_HEIGHT) for one in seen]) ** -2.0

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from birdslam.geometry.se2 import SE2
 from birdslam.road_users.placement.localisation import Observation, Place
 from birdslam.road_users.placement.uncertain_yaw import HeadingConfig
-from birdslam.road_users.state.parallax_config import ParallaxConfig
 from birdslam.types import MotionEdge
 
 
@@ -40,9 +39,8 @@ class TrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     body_yaw_inflation: float = 3.0  # of the sigma of a yaw from a network, for the same reason
     sigma_yaw_unknown_rad: float = 0.2  # of a CV edge's yaw before it is measured
     sigma_yaw_moving_rad: float = 0.1  # minimum of a CV edge's yaw after it is measured
-    parallax: ParallaxConfig = ParallaxConfig()
     heading: HeadingConfig = HeadingConfig()
-    standing_probability: float = 0.5  # by parallax, above which motion does not correct the yaw
+    standing_probability: float = 0.5  # above which motion does not correct the yaw
     sigma_standing_mps: float = 2.0  # of the zero-velocity update: the vehicle may start
     late_sigma_m: float = 3.0  # maximum position sigma of a late detection for an edge in the current frame
 
@@ -103,7 +101,7 @@ class VehicleTrack(Track):
     sigma_yaw_rad: float = 0.0  # of a yaw measured by motion or body
     is_yaw_known: bool = False
     front_logit: float = 0.0  # log odds that the yaw points to the front
-    is_stationary: bool = False  # probably, by parallax
+    is_stationary: bool = False  # probably
     motion: MotionEdge | None = None  # VV edge from its last CV edge, as predicted before the update
 
     @property

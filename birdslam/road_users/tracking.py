@@ -65,9 +65,9 @@ class Tracker:
         self.pseudolidar = pseudolidar or PseudoLidarConfig()
         self.frustum_network = frustum_network
         self.ground_size = ground_size
-        self.placing = Placing(ground_size, localisation, config.parallax, self.pseudolidar, config.heading)
+        self.placing = Placing(ground_size, localisation, self.pseudolidar, config.heading)
         self.yaw = YawFilter(config, localisation, ground_size)
-        filters = self.placing.parallax, ground_size, self.placing.yaw_by_outline  # with one row per track
+        filters = self.placing.users, ground_size, self.placing.yaw_by_outline  # with one row per track
         self.life = LifeCycle[VehicleTrack](config, config.forget_s, filters, first_id)
         self._last: EgoFrame | None = None
 
@@ -238,12 +238,8 @@ class Tracker:
         gain = cov[:, :, :2] @ information
         corrected = state + (gain @ innovation[..., None])[..., 0]
         corrected_cov = cov - gain @ S @ gain.swapaxes(1, 2)
-        is_stationary = np.array(
-            [
-                self.placing.parallax.stationary_probability(a.row) > self.config.standing_probability
-                for _, a, _ in known
-            ]
-        )
+        standing = self.placing.users.stationary_probability()[[a.row for _, a, _ in known]]
+        is_stationary = standing > self.config.standing_probability
         self._zero_velocity_update(corrected, corrected_cov, is_stationary)
         for k, (track, assignment, seen) in enumerate(known):
             track.motion = self._predicted_motion(track, frame)

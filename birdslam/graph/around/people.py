@@ -1,6 +1,6 @@
 """The tracked people in world, relative to the newest ego pose.
 
-They are filtered outside the graph (road_users/people/), since their boxes carry no information about the ego.
+They are filtered outside the graph (road_users/models/), since their boxes carry no information about the ego.
 This module transforms them to the world of the graph, adds the covariance of the ego, and predicts them over frames
 without an image.
 """

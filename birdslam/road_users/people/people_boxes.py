@@ -1,7 +1,7 @@
 """People in the boxes of a detector: joins riders with bicycles, finds occluded feet.
 
 The lower edge of a box is where the feet meet the road, unless a nearer box or the image border covers it. `hidden` is
-the prior probability of that; people_filter.py weighs it against size and row of the box.
+the prior probability of that; the filter weighs it against size and row of the box.
 """
 
 from __future__ import annotations

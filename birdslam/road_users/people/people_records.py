@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from birdslam.road_users.people.people_state import HEIGHT, VX
+from birdslam.road_users.models.user_state import HEIGHT, PLACE, VELOCITY
 from birdslam.road_users.people.people_tracker import PeopleTracker
 from birdslam.road_users.track import EgoFrame
 from birdslam.types import FollowedPerson, Moves
@@ -23,18 +23,18 @@ def followed_people(tracker: PeopleTracker, present: EgoFrame) -> tuple[Followed
     stand = np.array([track.is_stationary and track.hits >= MIN_REPORT_FRAMES for track in tracks], dtype=np.bool_)
     moments = tracker.filter.moments(after_s, stand)
     R, T = present.T_world_ego.rotation(), present.T_world_ego
-    at = ((moments.mean[:, :2] - [T.x_m, T.y_m]) @ R).tolist()
-    velocity = (moments.mean[:, VX:HEIGHT] @ R).tolist()
-    cov = (R.T @ moments.cov[:, :2, :2] @ R).reshape(-1, 4).tolist()
-    velocity_cov = (R.T @ moments.cov[:, VX:HEIGHT, VX:HEIGHT] @ R).reshape(-1, 4).tolist()
+    at = ((moments.mean[:, PLACE] - [T.x_m, T.y_m]) @ R).tolist()
+    velocity = (moments.mean[:, VELOCITY] @ R).tolist()
+    cov = (R.T @ moments.cov[:, PLACE, PLACE] @ R).reshape(-1, 4).tolist()
+    velocity_cov = (R.T @ moments.cov[:, VELOCITY, VELOCITY] @ R).reshape(-1, 4).tolist()
     log_height, sigma = moments.mean[:, HEIGHT].tolist(), np.sqrt(moments.cov[:, HEIGHT, HEIGHT]).tolist()
-    child, standing = (np.clip(share, 0.0, 1.0).tolist() for share in (moments.child, moments.standing))
+    child, standing = (np.clip(share, 0.0, 1.0).tolist() for share in (moments.odd_size, moments.standing))
     stands, out = stand.tolist(), []
     for k, track in enumerate(tracks):
         if track.number < 0:
             continue
         height_m = math.exp(log_height[k])
-        sizes = tracker.config.sizes(track.label)
+        sizes = tracker.config.priors(track.label)
         (x, y), (vx, vy) = at[k], velocity[k]
         moves = Moves.STANDING if stands[k] else Moves.DRIVING if track.hits >= MIN_REPORT_FRAMES else Moves.UNDECIDED
         out.append(

@@ -14,8 +14,9 @@ from birdslam.geometry.bev import RoadProfile
 from birdslam.geometry.camera import Camera
 from birdslam.perception import Detections
 from birdslam.road_users.life_cycle import LifeCycle
+from birdslam.road_users.models.user_filter import UserFilter
 from birdslam.road_users.out_of_sequence import OpenFrame
-from birdslam.road_users.people.box_model import MIN_DT_S, MIN_SLOPE, road_tilts
+from birdslam.road_users.people.box_model import MIN_DT_S, MIN_SLOPE, measured_boxes, road_tilts
 from birdslam.road_users.people.people_boxes import (
     BICYCLE,
     CYCLIST,
@@ -24,13 +25,12 @@ from birdslam.road_users.people.people_boxes import (
     observe_people,
 )
 from birdslam.road_users.people.people_config import PeopleConfig
-from birdslam.road_users.people.people_filter import PeopleFilter
 from birdslam.road_users.placement.localisation import LocalisationConfig
-from birdslam.road_users.state.ground_size_config import TILT_MEMORY_S
 from birdslam.road_users.state.ground_size_filter import GroundSizeFilter
 from birdslam.road_users.track import Track, TrackingConfig
 from birdslam.types import FIRST_PERSON
 
+BIRTH_ITERATIONS = 4  # of the update by the first box
 NEW_PER_S = 1.0  # rate of new people, per unit of bearing, slope and log height
 SIDE_MARGIN = 0.03  # of the image width, beyond which a person has left
 MAX_OUTSIDE_S = 0.3  # until a person outside the image is removed
@@ -84,10 +84,9 @@ class PeopleTracker:
         self.config = config
         self.tracking = tracking
         self.localisation = localisation
-        self.filter = PeopleFilter(config)
+        self.filter = UserFilter(config.kinds)
         self.life = LifeCycle[PersonTrack](tracking, FORGET_S, (self.filter,), first_id)
         self.frame: OpenFrame | None = None  # last settled frame
-        self._pitch_rad: float | None = None
 
     @property
     def tracks(self) -> list[PersonTrack]:
@@ -98,39 +97,33 @@ class PeopleTracker:
         """Processes the next frame; `detections` is None if no detector processed it, `road` is the ground in it."""
         ego, ground = frame.ego, road.ground
         profile = RoadProfile(ground.height_m, road.vertical_per_m)
-        self._predict(frame, road)
+        self.filter.predict(frame.dt_s, ego.T_world_ego, ego.step_cov, road.step)
         self.frame = frame
         if detections is not None:
             self.life.count_missed()
             boxes = observe_people(detections, self.camera, ground, self.localisation)
             pairs = self._associate(boxes, frame, profile)
-            rows = [row for row, _ in pairs]
-            self.filter.correct(rows, [boxes[k] for _, k in pairs], ego.T_world_ego, profile)
-            unseen_s = []
+            seen, unseen_s = [boxes[k] for _, k in pairs], []
+            measured = measured_boxes(seen, ego.T_world_ego, self.config)
+            self.filter.correct([row for row, _ in pairs], measured, ego.T_world_ego, profile)
             for row, k in pairs:
                 track = self.tracks[row]
                 unseen_s.append((ego.t_source_ns - track.frame.t_source_ns) * 1e-9)
                 track.box = boxes[k]
                 self.life.observe(track, ego, boxes[k].label)
             born = self._start_tracks(boxes, {k for _, k in pairs}, frame, profile)
-            seen, unseen_s = [*(boxes[k] for _, k in pairs), *born], [*unseen_s, *[math.inf] * len(born)]
-            road.correct_by_people(road_tilts(seen, unseen_s, profile, self.config))
+            unseen_s += [math.inf] * len(born)
+            road.correct_by_people(road_tilts([*seen, *born], unseen_s, profile, self.config))
             self.filter.set_common_priors(np.array([(0.0, road.sigma_pitch_rad**2), road.bodies]))
         self._finish_frame(frame)
-
-    def _predict(self, frame: OpenFrame, road: GroundSizeFilter) -> None:
-        ego, pitch_rad = frame.ego, road.ground.pitch_rad
-        shift_rad = 0.0 if self._pitch_rad is None else pitch_rad - self._pitch_rad - (frame.turn_rad or 0.0)
-        self._pitch_rad = pitch_rad
-        driving = road.driving_share(frame.dt_s, frame.travelled_m)
-        keep_tilt = math.exp(-driving * frame.dt_s / TILT_MEMORY_S)
-        self.filter.predict(frame.dt_s, ego.T_world_ego, ego.step_cov, shift_rad, driving, keep_tilt)
 
     def _associate(self, boxes: Sequence[PersonBox], frame: OpenFrame, road: RoadProfile) -> list[tuple[int, int]]:
         """Pairs (row, box) of least total cost, -2 log likelihood within the gate."""
         if not boxes or not self.tracks:
             return []
-        squared, costs = self.filter.distances(boxes, frame.ego.T_world_ego, road)
+        squared, costs = self.filter.distances(
+            measured_boxes(boxes, frame.ego.T_world_ego, self.config), frame.ego.T_world_ego, road
+        )
         costs += self._shape_costs(boxes)
         squared, costs = np.where(costs[0] <= costs[1], squared[0], squared[1]), costs.min(axis=0)
         last_ns = max(track.frame.t_source_ns for track in self.tracks)
@@ -183,7 +176,13 @@ class PeopleTracker:
         unmatched = self.life.births([box.score for box in boxes], matched)
         births = [boxes[k] for k in unmatched if boxes[k].label != BICYCLE]
         ego = frame.ego
-        self.filter.add_people(births, ego.T_world_ego, road)
+        if not births:
+            return births
+        seen, before = measured_boxes(births, ego.T_world_ego, self.config), len(self.filter)
+        kinds = [self.config.kind(box.label) for box in births]
+        heights = np.array([self.config.kinds[kind].heights for kind in kinds])
+        self.filter.add(kinds, seen, heights, np.zeros(len(births)), ego.T_world_ego)
+        self.filter.correct(range(before, len(self.filter)), seen, ego.T_world_ego, road, BIRTH_ITERATIONS)
         self.tracks.extend(PersonTrack(frame=ego, box=box, votes=Counter({box.label: 1})) for box in births)
         return births
 

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera, GroundPlane, VerticalCurvature
+from birdslam.road_users.models.user_filter import GrownSize, RoadStep
 from birdslam.road_users.placement.localisation import Dimensions, Observation
 from birdslam.road_users.state.ground_measurements import (
     BODY,
@@ -56,7 +57,6 @@ from birdslam.road_users.state.ground_size_config import (
     WIDTH_TURNED_REL,
     GroundSizeConfig,
 )
-from birdslam.road_users.state.parallax import LearnedSize
 from birdslam.road_users.state.size_prior import MIN_VARIANCE, SizePrior
 
 Floats = NDArray[np.float64]
@@ -106,6 +106,7 @@ class GroundSizeFilter:
         self._P = np.diag([*config.road_var, *IMAGE_VAR, *common, FLAT_VARIANCE, self._body_var])
         self._sizes = SizePrior(SIGMA_COMMON_REL, SIZE_DOF)
         self._image_ground = camera.ground
+        self._turned_rad, self._share, self._keep_tilt = 0.0, 1.0, 1.0  # since the start; of the last step
 
     def __len__(self) -> int:
         return len(self._unseen_s)
@@ -114,6 +115,11 @@ class GroundSizeFilter:
     def ground(self) -> GroundPlane:
         """Estimated road under the camera."""
         return GroundPlane(self._image_ground.height_m, float(self._x[PITCH]), float(self._x[ROLL]))
+
+    @property
+    def step(self) -> RoadStep:
+        """The change of the road to this frame, for the filters of road users."""
+        return RoadStep(float(self._x[PITCH]) - self._turned_rad, self._share, self._keep_tilt)
 
     @property
     def sigma_roll_rad(self) -> float:
@@ -202,9 +208,11 @@ class GroundSizeFilter:
         self._unseen_s = self._unseen_s + dt_s
         self._driven_s = self._driven_s + share * dt_s
         self._x[PITCH] += turn_rad or 0.0
+        self._turned_rad += turn_rad or 0.0
         keep = np.exp(-share * dt_s / config.road_memory_s)
         keep_image = np.exp(-share * dt_s / np.array([IMAGE_PITCH_MEMORY_S, IMAGE_ROLL_MEMORY_S]))
         keep_tilt = math.exp(-share * dt_s / TILT_MEMORY_S)
+        self._share, self._keep_tilt = share, keep_tilt
         scale = np.ones(len(self._x))
         scale[_ROAD], scale[_IMAGES], scale[COMMON + TILT :: OWN] = keep, keep_image, keep_tilt
         self._x *= scale
@@ -250,13 +258,13 @@ class GroundSizeFilter:
         outlines_m: Floats,
         extents_m: Floats,
         turned_rad: Floats,
-        learned: LearnedSize | None = None,
+        learned: GrownSize | None = None,
     ) -> Depths:
         """Returns the depths of all boxes (N) of this frame; updates tilt and sizes.
 
         `outlines_m` and `extents_m` (N,) are the class's extent across and along the line of sight at its yaw;
         `turned_rad` (N,) is the rotation of the line of sight since the last observation. Observations are relative to
-        the current `ground`. `learned` (N, K), sizes by parallax, affects the returned depths but not the state.
+        the current `ground`. `learned` (N,), sizes by growth, affects the returned depths but not the state.
         """
         n = len(seen)
         if not n:
@@ -278,15 +286,13 @@ class GroundSizeFilter:
         self._x, self._P = self._sizes.reweigh(rows, self._x, self._P, at, SIZE)
         if learned is None:
             return Depths(log_z, P_z, log_h, P_h, P_zh / P_h)
-        gap = learned.log_height - log_h[:, None]
-        of_depth, of_height = (P[:, None] / (P_h[:, None] + learned.variance) for P in (P_zh, P_h))
-        return Depths(
-            *_mixed(learned.weight, log_z[:, None] + of_depth * gap, P_z[:, None] - of_depth * P_zh[:, None]),
-            *_mixed(learned.weight, log_h[:, None] + of_height * gap, P_h[:, None] - of_height * P_h[:, None]),
-            P_zh / P_h,
+        depth, height = (
+            _pulled(mean, variance, cross, learned, log_h, P_h)
+            for mean, variance, cross in ((log_z, P_z, P_zh), (log_h, P_h, P_h))
         )
+        return Depths(*depth, *height, P_zh / P_h)
 
-    def _outline_drift(self, rows: Sequence[int], turned_rad: Floats, learned: LearnedSize | None) -> Floats:
+    def _outline_drift(self, rows: Sequence[int], turned_rad: Floats, learned: GrownSize | None) -> Floats:
         """Returns (N,) the growth of the variance of each log outline since it was last seen.
 
         The line of sight turns with the ego motion, and for a moving vehicle with its own speed. The outline of a
@@ -304,7 +310,7 @@ class GroundSizeFilter:
             return 1.0
         return -math.expm1(-travelled_m / max(dt_s, _MIN_DT_S) / DRIVING_MPS)
 
-    def _correlated_frames(self, rows: Sequence[int], learned: LearnedSize | None) -> Floats:
+    def _correlated_frames(self, rows: Sequence[int], learned: GrownSize | None) -> Floats:
         """(N,) number of consecutive frames with the same error, from the change of view since the last observation.
 
         Errors of a box decorrelate as ego or vehicle move. While both are stationary, all images show the same error.
@@ -411,7 +417,10 @@ def estimate_curvature(by_lanes: VerticalCurvature, scale_per_m: float, dof: flo
     return mean, variance
 
 
-def _mixed(weight: Floats, means: Floats, variances: Floats) -> tuple[Floats, Floats]:
-    """Mean (N,) and variance (N,) of mixtures (N, K)."""
-    mean = (weight * means).sum(axis=1)
-    return mean, (weight * (np.square(means - mean[:, None]) + variances)).sum(axis=1)
+def _pulled(
+    mean: Floats, variance: Floats, cross: Floats, by: GrownSize, log_h: Floats, P_h: Floats
+) -> tuple[Floats, Floats]:
+    """Mean and variance (N,), given the log height by growth if stationary; `cross` is the covariance with log_h."""
+    gain, p = cross / (P_h + by.variance), by.stationary
+    step = gain * (by.log_height - log_h)
+    return mean + p * step, variance - p * gain * cross + p * (1.0 - p) * np.square(step)
