@@ -20,8 +20,6 @@ class TrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Parameters of association and of the motion model."""
 
     min_iou: float = 0.15  # with the predicted box
-    min_iou_just_seen: float = 0.4  # within `just_seen_s` and not cut by the border; lower
-    just_seen_s: float = 0.15  # overlaps are mostly with neighbours
     gate_sigma: float = 3.0  # Mahalanobis gate in bird's-eye view
     birth_score: float = 0.5  # minimum score of a detection to start a track
     confirm_hits: int = 2  # number of detections until a track gets its id

@@ -14,14 +14,14 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.bev import RoadProfile
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2, wrap
 from birdslam.perception import DepthMap, Detections
-from birdslam.road_users.association import assign_track_ids, at_border, match_track_ids, predict_boxes_px, within_gate
+from birdslam.road_users.association import MAX_SQUARED_SIGMAS, assign_track_ids, match_track_ids, predict_boxes_px
 from birdslam.road_users.life_cycle import LifeCycle
 from birdslam.road_users.placement.depth_fusion import DepthPlace, PseudoLidarConfig
 from birdslam.road_users.placement.localisation import (
-    MIN_DISTANCE_M,
     LocalisationConfig,
     Observation,
     Place,
@@ -30,6 +30,7 @@ from birdslam.road_users.placement.localisation import (
     observe_boxes,
 )
 from birdslam.road_users.placement.pseudolidar import FrustumNetwork, locate_by_depth
+from birdslam.road_users.placement.vehicle_boxes import association_boxes
 from birdslam.road_users.placing import Assignment, Placing
 from birdslam.road_users.state.ground_size_filter import GroundSizeFilter
 from birdslam.road_users.state.yaw_filter import YawFilter
@@ -37,8 +38,6 @@ from birdslam.road_users.track import EgoFrame, TrackingConfig, VehicleTrack, in
 from birdslam.types import MotionEdge
 
 Floats = NDArray[np.float64]
-
-MAX_MOTION_SIGMAS = 2.0  # of the motion since the last observation, for association
 
 
 class Tracker:
@@ -195,32 +194,14 @@ class Tracker:
             return []
         if observations[0].track_id is not None:
             return match_track_ids(self.tracks, observations)
+        profile = RoadProfile(self.ground_size.ground.height_m, self.ground_size.vertical_per_m)
+        beside = np.array([t.observation.bearing - t.place.centre_m[1] / t.place.centre_m[0] for t in self.tracks])
+        squared, _ = self.placing.users.distances(association_boxes(observations), T_world_ego, profile, beside)
         predicted = predict_boxes_px(self.tracks, self.camera, T_world_ego, self.ground_size.ground)
         overlap = np.nan_to_num(iou(predicted, np.array([o.box_px for o in observations])), nan=0.0)
-        more = overlap - self._min_overlaps(predicted)[:, None]
-        possible = (more >= 0.0) & within_gate(self.tracks, observations, T_world_ego, self.config.gate_sigma)
+        more = overlap - self.config.min_iou
         # A missing box costs as much as one at the bound, so that no box is shifted to another track
-        return self.life.associate(-more, possible, 0.0)
-
-    def _min_overlaps(self, predicted_px: Floats) -> Floats:
-        """(N,) minimum overlap of an observation with each predicted box (N, 4).
-
-        After an interval without observations it decreases to the overlap of boxes that are MAX_MOTION_SIGMAS apart.
-        """
-        assert self._last is not None
-        t_ns, T_world_ego = self._last.t_source_ns, self._last.T_world_ego
-        unseen_s = np.array([(t_ns - track.frame.t_source_ns) * 1e-9 for track in self.tracks])
-        R = T_world_ego.rotation()
-        ahead, aside = np.einsum("ji,njk,ki->in", R, np.array([track.cov[2:, 2:] for track in self.tracks]), R)
-        sight = (np.array([track.state[:2] for track in self.tracks]) - [T_world_ego.x_m, T_world_ego.y_m]) @ R
-        depth_m = np.maximum(sight[:, 0], MIN_DISTANCE_M)
-        nearer = MAX_MOTION_SIGMAS * np.sqrt(ahead) * unseen_s / depth_m  # relative
-        shift_px = MAX_MOTION_SIGMAS * np.sqrt(aside) * unseen_s / depth_m * self.camera.fx_px
-        shift = np.minimum(shift_px / np.maximum(predicted_px[:, 2] - predicted_px[:, 0], 1.0), 1.0)
-        left = (1.0 - shift) / (1.0 + shift) / np.square(1.0 + nearer)
-        just_seen = np.where(unseen_s <= self.config.just_seen_s, 1.0, left)
-        least = np.maximum(self.config.min_iou, self.config.min_iou_just_seen * just_seen)
-        return np.where(at_border(predicted_px, self.camera), self.config.min_iou, least)
+        return self.life.associate(-more, (more >= 0.0) & (squared[0] <= MAX_SQUARED_SIGMAS), 0.0)
 
     def _correct(self, assignments: Sequence[Assignment], places: Sequence[Place], frame: EgoFrame) -> None:
         """Updates the known tracks by the places of their observations, all at once."""

@@ -307,14 +307,18 @@ class UserFilter:
             self._P = self._P - change[..., None, None] * gain[..., :, None] * Pa[..., None, :]
         self._common = priors
 
-    def distances(self, boxes: Boxes, T_world_ego: SE2, road: RoadProfile) -> tuple[Floats, Floats]:
+    def distances(
+        self, boxes: Boxes, T_world_ego: SE2, road: RoadProfile, beside: Floats | float = 0.0
+    ) -> tuple[Floats, Floats]:
         """(C, N, M) squared Mahalanobis distances of boxes from road users, and -2 log likelihoods, by case of a box.
 
-        The width is not used: shapes are compared from box to box.
+        The width is not used: shapes are compared from box to box. `beside` (N,) is the bearing from the centre of a
+        road user to the middle of its box.
         """
         expected, J = expected_boxes(self._x, self._reach_m, self._top_m, T_world_ego, road)
         expected, J = expected[..., :WIDE], J[..., :WIDE, :]
         mean, S = merge_mixture(expected, J @ self._P @ J.swapaxes(-1, -2), self._weight)
+        mean[:, BEARING] += beside
         cases = boxes.cases
         sigma = cases.sigma[..., :WIDE].swapaxes(0, 1)  # (C, M, 3)
         noise = boxes.R[:, :WIDE, :WIDE] + sigma[..., :, None] * sigma[..., None, :]

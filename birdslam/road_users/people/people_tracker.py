@@ -13,6 +13,7 @@ from birdslam.geometry.arrays import Floats
 from birdslam.geometry.bev import RoadProfile
 from birdslam.geometry.camera import Camera
 from birdslam.perception import Detections
+from birdslam.road_users.association import MAX_SQUARED_SIGMAS
 from birdslam.road_users.life_cycle import LifeCycle
 from birdslam.road_users.models.user_filter import UserFilter
 from birdslam.road_users.out_of_sequence import OpenFrame
@@ -35,7 +36,6 @@ NEW_PER_S = 1.0  # rate of new people, per unit of bearing, slope and log height
 SIDE_MARGIN = 0.03  # of the image width, beyond which a person has left
 MAX_OUTSIDE_S = 0.3  # until a person outside the image is removed
 MIN_STATIONARY_PROBABILITY, MIN_STAY_PROBABILITY = 0.7, 0.4  # hysteresis of standing
-MAX_SQUARED_SIGMAS = 16.3  # squared Mahalanobis distance of bearing, bottom and top: 99.9 % of three
 FORGET_S = 1.5  # without a box, with an id
 SEEN_FOR_S = 1.1  # mean time until a person has no box
 HIDDEN_FOR_S = 0.65  # mean time until the box returns

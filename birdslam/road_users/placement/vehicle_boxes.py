@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -100,3 +101,16 @@ def measure_boxes(
         outline_var=np.square(turned_rad),
         face_var=np.square(SIGMA_FACE_M / depth),
     )
+
+
+def association_boxes(seen: Sequence[Observation]) -> Boxes:
+    """Measurements of observations (N,) whose vehicles, and so the yaws, are not known yet."""
+    extents = np.array([(o.dimensions.length_m, o.dimensions.width_m) for o in seen])
+    depth = np.array([o.depth_by_height_m for o in seen]) + extents[:, 0] / 2.0
+    bearing = np.array([o.bearing for o in seen])
+    zero = np.zeros(len(seen))
+    boxes = measure_boxes(seen, np.column_stack([depth, bearing * depth]), extents, zero, zero, zero)
+    turned = np.array([0.5 if o.is_cut_at_side else 0.05 for o in seen])
+    boxes.R[:, BEARING, BEARING] += np.square(turned * extents[:, 0] / depth)
+    nothing = np.zeros((len(seen), 1, 4))
+    return replace(boxes, cases=Cases(np.ones((len(seen), 1)), nothing, nothing, np.zeros((1, 1))))
