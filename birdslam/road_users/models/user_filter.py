@@ -195,12 +195,13 @@ class UserFilter:
         of_one[:, _SIZES, _SIZES] += boxes.face_var[:, None]
         lasting[:, _SIZES, _SIZES] += (boxes.face_var * of_view)[:, None]
         x = x0
-        for _ in range(iterations):
+        for left in reversed(range(iterations)):
             expected, J = expected_boxes(x, boxes.reach_m, boxes.top_m, T_world_ego, road)
             PJt = P0 @ J.swapaxes(-1, -2)
             predicted = J @ PJt
             innovation = boxes.z[:, None] - expected - (J @ (x0 - x)[..., None])[..., 0]
-            x = x0 + (PJt @ np.linalg.solve(predicted + lasting[:, None], innovation[..., None]))[..., 0]
+            if left:
+                x = x0 + (PJt @ np.linalg.solve(predicted + lasting[:, None], innovation[..., None]))[..., 0]
 
         # The cases of each box, (M, K, C). Errors last: the update uses inflated noise, and a box is evidence once per
         # correlation time, or repeated boxes favour one filter
@@ -208,15 +209,17 @@ class UserFilter:
         of_case = cases.sigma[..., :, None] * cases.sigma[..., None, :]
         gap = innovation[:, :, None] - cases.shift[:, None]
         S = predicted[:, :, None] + (lasting[:, None] + of_case * of_box[:, None, None, None])[:, None]
-        jump = np.zeros((*x0.shape[:2], cases.prior.shape[1], len(STATES)))
-        along = np.stack([np.cos(boxes.direction_rad), np.sin(boxes.direction_rad)], axis=-1)
-        jump[..., PLACE] = (cases.jump_m * along[:, None])[:, None]
-        of_jump = jump @ J.swapaxes(-1, -2)
-        S += of_jump[..., :, None] * of_jump[..., None, :]
-        PJt = PJt[:, :, None] + jump[..., :, None] * of_jump[..., None, :]
+        P, PJt = P0[:, :, None], PJt[:, :, None]
+        if cases.jump_m.any():
+            along = np.stack([np.cos(boxes.direction_rad), np.sin(boxes.direction_rad)], axis=-1)
+            jump = np.zeros((*x0.shape[:2], len(cases.jump_m), len(STATES)))
+            jump[..., PLACE] = (cases.jump_m * along[:, None])[:, None]
+            of_jump = jump @ J.swapaxes(-1, -2)
+            S += of_jump[..., :, None] * of_jump[..., None, :]
+            P, PJt = P + jump[..., :, None] * jump[..., None, :], PJt + jump[..., :, None] * of_jump[..., None, :]
         gain = PJt @ np.linalg.inv(S)
         x = x0[:, :, None] + (gain @ gap[..., None])[..., 0]
-        P = P0[:, :, None] + jump[..., :, None] * jump[..., None, :] - gain @ PJt.swapaxes(-1, -2)
+        P = P - gain @ PJt.swapaxes(-1, -2)
         S += (of_one - lasting)[:, None, None]
         squared = (gap * np.linalg.solve(S, gap[..., None])[..., 0]).sum(axis=-1)
         evidence = -0.5 * (squared + np.linalg.slogdet(S)[1])
@@ -225,7 +228,8 @@ class UserFilter:
         share = np.exp(evidence - best)
         total = share.sum(axis=2, keepdims=True)
         share /= total
-        self._x[at], self._P[at] = merge_mixture(x, (P + P.swapaxes(-1, -2)) / 2.0, share)
+        self._x[at], P = merge_mixture(x, P, share)
+        self._P[at] = (P + P.swapaxes(-1, -2)) / 2.0
         log_weight = np.log(self._weight[at]) + (best + np.log(total))[..., 0] / of_box[:, None]
         weight = np.exp(log_weight - log_weight.max(axis=1, keepdims=True))
         weight = np.maximum(weight / weight.sum(axis=1, keepdims=True), MIN_WEIGHT)

@@ -32,10 +32,11 @@ class Moments:
 
 def merge_mixture(x: Floats, P: Floats, weight: Floats) -> tuple[Floats, Floats]:
     """Mean (..., S), covariance (..., S, S) of Gaussian mixtures (..., C, S), (..., C, S, S), weights (..., C)."""
-    mean = (weight[..., None] * x).sum(axis=-2)
-    gap = x - mean[..., None, :]
-    spread = P + gap[..., :, None] * gap[..., None, :]
-    return mean, (weight[..., None, None] * spread).sum(axis=-3)
+    of_each = weight[..., None, :]
+    mean: Floats = of_each @ x
+    gap = x - mean
+    cov = (of_each @ P.reshape(*P.shape[:-2], -1)).reshape(*x.shape[:-2], *P.shape[-2:])
+    return mean[..., 0, :], cov + (gap * weight[..., None]).swapaxes(-1, -2) @ gap
 
 
 def ego_step_cov(at_m: Floats, T_world_ego: SE2, cov: Floats) -> Floats:
