@@ -37,6 +37,7 @@ PAPER = SlamConfig(
             sigma_pitch_blind_rad=1e-6,
             sigma_roll_rad=1e-6,
             sigma_kerb_m=1e-3,
+            sigma_common_edge_rel=0.0,
             sigma_edge_rel=0.0,
             sigma_tilt_rad=1e-6,
             sigma_crown_rad=0.0,

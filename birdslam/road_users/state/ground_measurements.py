@@ -19,10 +19,10 @@ from birdslam.geometry import bev
 
 Floats = NDArray[np.float64]
 
-# Common states: tilt of the camera over the road, its crown, systematic errors of the tilt by images, common error of
-# sizes, vertical curvature, common error of the heights of people over the road
-PITCH, ROLL, CROWN, IMAGE_PITCH, IMAGE_ROLL, SIZE, VERTICAL, BODY = range(8)
-COMMON, OWN = 8, 4  # numbers of common states, and of states per vehicle
+# Common states: tilt of the camera over the road, its crown, systematic errors of the tilt by images, common errors of
+# sizes and of lower edges, vertical curvature, common error of the heights of people over the road
+PITCH, ROLL, CROWN, IMAGE_PITCH, IMAGE_ROLL, SIZE, LOWER, VERTICAL, BODY = range(9)
+COMMON, OWN = 9, 4  # numbers of common states, and of states per vehicle
 HEIGHT, OUTLINE, EDGE, TILT = range(OWN)
 Cue = Literal["bottom", "top", "width"]
 CUES: tuple[Cue, ...] = ("bottom", "top", "width")  # measurements per box, in this order

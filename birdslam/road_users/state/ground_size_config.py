@@ -39,6 +39,7 @@ class GroundSizeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sigma_pitch_step_rad: float = 0.0008  # per frame of driving: change of grade, odometry error
     sigma_pitch_blind_rad: float = 0.003  # per frame without odometry
     sigma_kerb_m: float = 0.018  # ground offset under a vehicle from the ego's plane
+    sigma_common_edge_rel: float = 0.015  # of the height: common offset of all lower edges
     sigma_edge_rel: float = 0.022  # of the height: offset of the lower edge of a vehicle
     sigma_tilt_rad: float = 0.0015  # of the road at a vehicle relative to the ego
     sigma_crown_rad: float = 0.0038  # and its growth per unit of y/x

@@ -1,6 +1,6 @@
 """Joint Kalman filter of the road's tilt and the vehicles' sizes, from the boxes of all road users.
 
-    x = [pitch, roll, crown, errors of the images' tilt, common size, vertical curvature, size of people,
+    x = [pitch, roll, crown, errors of the images' tilt, common size and edge, vertical curvature, size of people,
          and of every vehicle: log h, log w, edge, tilt]      and, for one frame only, of every box: log z
 
 Systematic errors of a drive or a track are states, so that they do not average out over frames. Measurements:
@@ -25,9 +25,11 @@ from birdslam.road_users.state.ground_measurements import (
     COMMON,
     CROWN,
     CUES,
+    EDGE,
     HEIGHT,
     IMAGE_PITCH,
     IMAGE_ROLL,
+    LOWER,
     OUTLINE,
     OWN,
     PITCH,
@@ -85,7 +87,7 @@ class GroundSizeFilter:
     """Calls per frame: predict(), then estimate_depths().
 
     State: pitch and roll (rad) of the camera over the road, crown (rad), systematic errors of the tilt by images;
-    common log factor on heights, common log factor on the heights
+    common log factor on heights, common offset of lower edges relative to the height, common log factor on the heights
     of people; of each vehicle log height (m), log factor on the width of its outline, edge (m) and tilt (rad).
     Measurements: bottom and top slopes and log width of each box; tilt by people; pitch and roll (rad) by images.
     Readers: `placing.Placing` for depths and heights; `localisation.observe_boxes`, association, people, lanes and
@@ -100,7 +102,8 @@ class GroundSizeFilter:
         self._sigma_tilt = np.zeros(0)
         self._x = np.array([camera.pitch_rad, camera.roll_rad, *np.zeros(COMMON - 2)])
         self._body_var = SIGMA_BODIES_REL**2 + SIGMA_PAVEMENT_REL**2
-        self._P = np.diag([*config.road_var, *IMAGE_VAR, SIGMA_COMMON_REL**2, FLAT_VARIANCE, self._body_var])
+        common = np.square([SIGMA_COMMON_REL, config.sigma_common_edge_rel])
+        self._P = np.diag([*config.road_var, *IMAGE_VAR, *common, FLAT_VARIANCE, self._body_var])
         self._sizes = SizePrior(SIGMA_COMMON_REL, SIZE_DOF)
         self._image_ground = camera.ground
         self._turned_rad, self._share, self._keep_tilt = 0.0, 1.0, 1.0  # since the start; of the last step
@@ -175,7 +178,7 @@ class GroundSizeFilter:
         n = len(self._x)
         birth = np.zeros((n + OWN, n))  # log h = log h_class + common + own
         birth[:n] = np.eye(n)
-        birth[n + HEIGHT, SIZE] = share
+        birth[n + HEIGHT, SIZE], birth[n + EDGE, LOWER] = share, dimensions.height_m
         self._x = birth @ self._x + np.append(np.zeros(n), [math.log(dimensions.height_m), 0.0, 0.0, 0.0])
         self._P = birth @ self._P @ birth.T
         self._P[range(-OWN, 0), range(-OWN, 0)] += [
