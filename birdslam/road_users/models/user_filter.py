@@ -326,6 +326,7 @@ class UserFilter:
         cases = boxes.cases
         sigma = cases.sigma[..., :WIDE].swapaxes(0, 1)  # (C, M, 3)
         noise = boxes.R[:, :WIDE, :WIDE] + sigma[..., :, None] * sigma[..., None, :]
+        noise[..., TALL, TALL] += boxes.face_var
         whole = S[:, None] + noise[:, None]  # (C, N, M, 3, 3)
         gap = boxes.z[:, :WIDE] - cases.shift[..., :WIDE].swapaxes(0, 1)[:, None] - mean[:, None]
         squared = (gap * np.linalg.solve(whole, gap[..., None])[..., 0]).sum(axis=-1)
