@@ -19,7 +19,7 @@ from birdslam.geometry import bev
 from birdslam.geometry.bev import RoadProfile
 from birdslam.geometry.se2 import SE2, wrap
 from birdslam.road_users.association import in_ego
-from birdslam.road_users.models.user_boxes import TALL, Boxes
+from birdslam.road_users.models.user_boxes import Boxes
 from birdslam.road_users.models.user_filter import GrownSize, UserFilter
 from birdslam.road_users.placement.depth_fusion import DepthPlace, PseudoLidarConfig, fuse
 from birdslam.road_users.placement.localisation import (
@@ -42,9 +42,9 @@ from birdslam.road_users.placement.uncertain_yaw import (
     weigh_yaws,
 )
 from birdslam.road_users.placement.vehicle_boxes import (
+    ITERATIONS,
     KINDS,
     SIGMA_ODD_REL,
-    SIGMA_SCALE_REL,
     SIGMA_SIDE_OUTLIER_REL,
     measure_boxes,
     vehicle_kinds,
@@ -54,8 +54,6 @@ from birdslam.road_users.state.yaw_by_outline import YawByOutline
 from birdslam.road_users.track import VehicleTrack
 
 Floats = NDArray[np.float64]
-
-MAX_DEPTH_PER_BASELINE = 1e3  # beyond it the growth of a box measures nothing
 
 
 @dataclass(frozen=True)
@@ -100,14 +98,6 @@ class Assignment:
             return self.observation.depth_by_height_m
         reach_m = float(self.track.place.centre_m[0]) - self.track.place.depth_m
         return max(MIN_DISTANCE_M, in_ego(T_world_ego, self.track.state[:2])[0] - reach_m)
-
-    def depth_per_baseline(self, T_world_ego: SE2) -> float:
-        """Depth over the distance of the ego from where it first observed the vehicle."""
-        if self.track is None:
-            return MAX_DEPTH_PER_BASELINE
-        first_m = self.track.first_m - self.track.first_offset_m
-        baseline_m = math.hypot(T_world_ego.x_m - first_m[0], T_world_ego.y_m - first_m[1])
-        return min(self.expected_depth_m(T_world_ego) / max(baseline_m, 1e-3), MAX_DEPTH_PER_BASELINE)
 
     def turned_rad(self, T_world_ego: SE2) -> float:
         """Rotation over the ground of the line of sight since the last observation."""
@@ -226,12 +216,8 @@ class Placing:
         if not rows:
             return None, np.zeros((0, 2))
         profile = RoadProfile(road.ground.height_m, road.vertical_per_m)
-        cases = self.users.correct(rows, boxes, T_world_ego, profile)
-        sizes = self.users.sizes_by_growth(rows)
-        # Errors of boxes last: an error of the height by this fraction is one of the depth by z / baseline of it
-        z_per_baseline = np.array([a.depth_per_baseline(T_world_ego) for a in assignments])
-        of_boxes = np.square(z_per_baseline) * boxes.R[:, TALL, TALL]
-        return replace(sizes, variance=sizes.variance + of_boxes + boxes.face_var + SIGMA_SCALE_REL**2), cases[:, 1:3]
+        cases = self.users.correct(rows, boxes, T_world_ego, profile, ITERATIONS)
+        return self.users.sizes_by_growth(rows, boxes, T_world_ego), cases[:, 1:3]
 
     def _with_side_outliers(self, assignments: Sequence[Assignment], outlier: Floats) -> list[Assignment]:
         """Raises the sigmas of probable outlier sides of boxes, with probabilities (N, 2)."""

@@ -20,7 +20,7 @@ from birdslam.road_users.models.user_state import FOOT, HEAD, HEIGHT, OFFSET, PL
 
 CUES = BEARING, BOTTOM, TALL, WIDE = range(4)
 UNUSED_SIGMA = 1e3  # 1-sigma of an unused measurement
-MIN_DISTANCE_M = 0.7
+MIN_DISTANCE_M = 0.7  # of the centre of a road user, ahead of the camera
 
 
 @dataclass(frozen=True)
@@ -68,18 +68,20 @@ def expected_boxes(
     height, below = np.exp(x[..., HEIGHT]), road.height_m + x[..., OFFSET]
     tall = height / top
     nearer = top_m[:, None] * below / (depth * height)  # increase of the height by the nearer lower edge
+    margin = x[..., FOOT] * tall
     expected, J = np.empty((*x.shape[:2], len(CUES))), np.zeros((*x.shape[:2], len(CUES), len(STATES)))
     expected[..., BEARING] = y / ahead
-    expected[..., BOTTOM] = road.slope(depth, x[..., OFFSET]) - x[..., TILT] + x[..., FOOT] * tall  # Eq. 1
+    expected[..., BOTTOM] = road.slope(depth, x[..., OFFSET]) - x[..., TILT] + margin  # Eq. 1
     expected[..., TALL] = x[..., HEIGHT] - np.log(top) + np.log1p(nearer) + x[..., FOOT] - x[..., HEAD]
     expected[..., WIDE] = x[..., WIDTH] - np.log(depth)
-    falls = -below / depth**2 - 0.5 * road.vertical_per_m
+    falls = -below / depth**2 - 0.5 * road.vertical_per_m - margin / top
     shrinks = -1.0 / top - nearer / (1.0 + nearer) / depth
     by_depth = np.stack([-y / ahead**2, falls, shrinks, -1.0 / depth], axis=-1)
     J[..., PLACE] = by_depth[..., None] * R[:, 0]
     J[..., BEARING, PLACE] += R[:, 1] / ahead[..., None]
     J[..., BOTTOM, TILT], J[..., BOTTOM, OFFSET], J[..., BOTTOM, FOOT] = -1.0, 1.0 / depth, tall
     J[..., TALL, HEIGHT], J[..., TALL, FOOT], J[..., TALL, HEAD] = 1.0 / (1.0 + nearer), 1.0, -1.0
+    J[..., BOTTOM, HEIGHT], J[..., TALL, OFFSET] = margin, nearer / (1.0 + nearer) / below
     J[..., WIDE, WIDTH] = 1.0
     return expected, J
 

@@ -45,6 +45,7 @@ from birdslam.road_users.models.user_state import (
 INITIAL_DEPTH_SIGMA_REL = 0.6
 MIN_WEIGHT = 1e-6  # of a filter, so that it can recover
 UNKNOWN_VARIANCE = 1e6  # of an unmeasured size
+SIGMA_SCALE_REL = 0.02  # of the odometry's scale
 _MIN_DT_S, _MIN_PROBABILITY = 1e-3, 1e-300
 _SIZES = [TALL, WIDE]
 
@@ -86,6 +87,7 @@ class UserFilter:
         self._weight, self._kind = np.zeros((0, filters)), np.zeros(0, dtype=np.intp)
         # Of each road user: time since its last box, direction of travel, and geometry as in `Boxes`
         self._unseen_s, self._direction_rad, self._reach_m, self._top_m = np.zeros((4, 0))
+        self._born_m = np.zeros((0, 2))  # where the ego was at its first box
         # Log heights, and variances of the own parts of them; means and variances of common tilt and height
         self._log_height, self._own_var, self._common = np.zeros((0, filters)), np.zeros((0, filters)), np.zeros((2, 2))
         self._driving = 1.0  # as in `RoadStep`, as is:
@@ -105,6 +107,7 @@ class UserFilter:
             "direction_rad",
             "reach_m",
             "top_m",
+            "born_m",
             "log_height",
             "own_var",
         ):
@@ -179,11 +182,15 @@ class UserFilter:
         self._log_height = np.concatenate([self._log_height, log_height])
         self._own_var = np.concatenate([self._own_var, own_var])
         self._unseen_s = np.append(self._unseen_s, np.full(n, np.inf))
+        self._born_m = np.concatenate([self._born_m, np.tile([T_world_ego.x_m, T_world_ego.y_m], (n, 1))])
 
     def correct(
         self, rows: Sequence[int], boxes: Boxes, T_world_ego: SE2, road: RoadProfile, iterations: int = 1
     ) -> Floats:
-        """Updates the road users in `rows` by their boxes, one each; returns the probability of each case (M, C)."""
+        """Updates the road users in `rows` by their boxes, one each; returns the probability of each case (M, C).
+
+        `iterations` of an iterated Kalman filter linearize it, as if the boxes were complete (the first case).
+        """
         if not len(boxes.z):
             return np.zeros_like(boxes.cases.prior)
         at = np.asarray(rows, dtype=np.intp)
@@ -272,20 +279,29 @@ class UserFilter:
         out: Floats = self._weight[:, STATIONARY :: len(MOTIONS)].sum(axis=1)
         return out
 
-    def sizes_by_growth(self, rows: Sequence[int]) -> GrownSize:
-        """The sizes of these vehicles."""
-        at = np.asarray(rows, dtype=np.intp)
+    def sizes_by_growth(self, rows: Sequence[int], boxes: Boxes, T_world_ego: SE2) -> GrownSize:
+        """The sizes of the vehicles in `rows` after their `boxes` (M,).
+
+        Box errors are correlated, so that many boxes measure the distance z over the baseline b of the ego no better
+        than two: an error of the height of a box is one of z by the factor z / b.
+        """
+        at, ego_m = np.asarray(rows, dtype=np.intp), [T_world_ego.x_m, T_world_ego.y_m]
         stationary = slice(STATIONARY, None, len(MOTIONS))
         weight = self._weight[at, stationary]
+        share = weight / weight.sum(axis=1, keepdims=True)
         x, P = self._x[at, stationary, HEIGHT], self._P[at, stationary, HEIGHT, HEIGHT]
-        moments = merge_mixture(x[..., None], P[..., None, None], weight / weight.sum(axis=1, keepdims=True))
+        moments = merge_mixture(x[..., None], P[..., None, None], share)
         mean, var = moments[0][:, 0], moments[1][:, 0, 0]
-        prior, prior_var = self._log_height[at, STATIONARY], self._own_var[at, STATIONARY]
+        prior, prior_var = ((share * of[at, stationary]).sum(axis=1) for of in (self._log_height, self._own_var))
         information = np.maximum(1.0 / var - 1.0 / prior_var, 1.0 / UNKNOWN_VARIANCE)
+        place = (share[..., None] * self._x[at, stationary, PLACE]).sum(axis=1)
+        z2, b2 = np.square(place - ego_m).sum(axis=1), np.square(self._born_m[at] - ego_m).sum(axis=1)
+        lasting = boxes.R[:, TALL, TALL] * z2 / np.maximum(b2, z2 / UNKNOWN_VARIANCE)
+        lasting += boxes.face_var + SIGMA_SCALE_REL**2
         square = np.square(self._x[at][..., VELOCITY]).sum(axis=-1)
         return GrownSize(
             np.where(information > 1.0 / UNKNOWN_VARIANCE, (mean / var - prior / prior_var) / information, prior),
-            1.0 / information,
+            1.0 / information + lasting,
             self.stationary_probability()[at],
             np.sqrt((self._weight[at] * square).sum(axis=1)),
         )

@@ -19,8 +19,8 @@ SIGMA_SIDE_OUTLIER_REL = 0.3  # of the width of the box
 NEIGHBOUR_RATIO = 0.02  # probability that a box is that of the next vehicle along the road
 SIGMA_NEIGHBOUR_M = 5.0  # from a vehicle to it
 SIGMA_FACE_M = 1.0  # of the depth of the faces at a box's edges
-SIGMA_SCALE_REL = 0.02  # of the odometry's scale
 SIGMA_ODD_REL = 0.3  # of the height of a vehicle of an odd size
+ITERATIONS = 2  # of an update, since the first depth of an unusual vehicle may be wrong by half
 ROAD_HALF_WIDTH_M = 10.0  # lateral distance beyond which vehicles move in any direction
 
 CROSSING_RATIO = 0.05  # initial probability of a motion in any direction
