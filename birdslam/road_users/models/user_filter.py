@@ -87,7 +87,8 @@ class UserFilter:
         self._weight, self._kind = np.zeros((0, filters)), np.zeros(0, dtype=np.intp)
         # Of each road user: time since its last box, direction of travel, and geometry as in `Boxes`
         self._unseen_s, self._direction_rad, self._reach_m, self._top_m = np.zeros((4, 0))
-        self._born_m = np.zeros((0, 2))  # where the ego was at its first box
+        # Where the ego was at its first box, and for how long it has driven since
+        self._born_m, self._driven_s = np.zeros((0, 2)), np.zeros(0)
         # Log heights, and variances of the own parts of them; means and variances of common tilt and height
         self._log_height, self._own_var, self._common = np.zeros((0, filters)), np.zeros((0, filters)), np.zeros((2, 2))
         self._driving = 1.0  # as in `RoadStep`, as is:
@@ -108,6 +109,7 @@ class UserFilter:
             "reach_m",
             "top_m",
             "born_m",
+            "driven_s",
             "log_height",
             "own_var",
         ):
@@ -125,6 +127,7 @@ class UserFilter:
         self._driving = road.driving
         self._common[0, 0] -= shift_rad
         self._unseen_s += dt_s
+        self._driven_s += road.driving * dt_s
         if not len(self._x) or dt_s <= 0.0:
             return
         motions, change = self._motions[self._kind], transitions(self._per_s, dt_s)[self._kind]
@@ -183,6 +186,7 @@ class UserFilter:
         self._own_var = np.concatenate([self._own_var, own_var])
         self._unseen_s = np.append(self._unseen_s, np.full(n, np.inf))
         self._born_m = np.concatenate([self._born_m, np.tile([T_world_ego.x_m, T_world_ego.y_m], (n, 1))])
+        self._driven_s = np.append(self._driven_s, np.zeros(n))
 
     def correct(
         self, rows: Sequence[int], boxes: Boxes, T_world_ego: SE2, road: RoadProfile, iterations: int = 1
@@ -282,25 +286,26 @@ class UserFilter:
     def sizes_by_growth(self, rows: Sequence[int], boxes: Boxes, T_world_ego: SE2) -> GrownSize:
         """The sizes of the vehicles in `rows` after their `boxes` (M,).
 
-        Box errors are correlated, so that many boxes measure the distance z over the baseline b of the ego no better
-        than two: an error of the height of a box is one of z by the factor z / b.
+        Errors of boxes change while the ego drives only. Of n boxes with different errors, over a baseline b, an error
+        of the height of one is an error of the distance z by the factor z / b / sqrt(n).
         """
         at, ego_m = np.asarray(rows, dtype=np.intp), [T_world_ego.x_m, T_world_ego.y_m]
         stationary = slice(STATIONARY, None, len(MOTIONS))
         weight = self._weight[at, stationary]
         share = weight / weight.sum(axis=1, keepdims=True)
-        x, P = self._x[at, stationary, HEIGHT], self._P[at, stationary, HEIGHT, HEIGHT]
-        moments = merge_mixture(x[..., None], P[..., None, None], share)
-        mean, var = moments[0][:, 0], moments[1][:, 0, 0]
-        prior, prior_var = ((share * of[at, stationary]).sum(axis=1) for of in (self._log_height, self._own_var))
-        information = np.maximum(1.0 / var - 1.0 / prior_var, 1.0 / UNKNOWN_VARIANCE)
+        # The prior of each filter is removed from its posterior; the filters are pooled by their mean log likelihood
+        P, prior_P = self._P[at, stationary, HEIGHT, HEIGHT], self._own_var[at, stationary]
+        prior = self._log_height[at, STATIONARY]
+        information = np.maximum((share * (1.0 / P - 1.0 / prior_P)).sum(axis=1), 1.0 / UNKNOWN_VARIANCE)
+        learned = (share * (self._x[at, stationary, HEIGHT] - prior[:, None]) / P).sum(axis=1) / information
         place = (share[..., None] * self._x[at, stationary, PLACE]).sum(axis=1)
         z2, b2 = np.square(place - ego_m).sum(axis=1), np.square(self._born_m[at] - ego_m).sum(axis=1)
-        lasting = boxes.R[:, TALL, TALL] * z2 / np.maximum(b2, z2 / UNKNOWN_VARIANCE)
+        different = 1.0 + self._driven_s[at] / self._of("box_memory_s", self._kind[at]).ravel()
+        lasting = boxes.R[:, TALL, TALL] / different * z2 / np.maximum(b2, z2 / UNKNOWN_VARIANCE)
         lasting += boxes.face_var + SIGMA_SCALE_REL**2
         square = np.square(self._x[at][..., VELOCITY]).sum(axis=-1)
         return GrownSize(
-            np.where(information > 1.0 / UNKNOWN_VARIANCE, (mean / var - prior / prior_var) / information, prior),
+            prior + np.where(information > 1.0 / UNKNOWN_VARIANCE, learned, 0.0),
             1.0 / information + lasting,
             self.stationary_probability()[at],
             np.sqrt((self._weight[at] * square).sum(axis=1)),
