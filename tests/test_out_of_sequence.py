@@ -74,7 +74,9 @@ def follow(used: list[int | None], noise_px: float = 0.5) -> tuple[list[tuple[fl
         tracks = vehicles.ingest_detections(
             None if source is None else detections(source, noise_px), -1 if source is None else source
         )
-        seen += [(t.frame.frame_id, t.number, *t.state.tolist(), *t.cov.ravel().tolist()) for t in tracks]
+        seen += [
+            (t.frame.frame_id, t.number, *t.predicted_m, *t.velocity_mps, *t.kinematic_cov.ravel()) for t in tracks
+        ]
         roads.append(vehicles.road.ground)
     return seen, roads
 
@@ -116,7 +118,9 @@ def test_frames_without_detector_are_processed_before_next_detections(every: int
             tracks = vehicles.ingest_detections(
                 found, known, awaited_from=(look if known < look else k + 1) if told else 0
             )
-            seen += [[t.frame.frame_id, t.number, *t.state.tolist(), *t.cov.ravel().tolist()] for t in tracks]
+            seen += [
+                [t.frame.frame_id, t.number, *t.predicted_m, *t.velocity_mps, *t.kinematic_cov.ravel()] for t in tracks
+            ]
             roads.append(vehicles.road.ground)
             settled.append(len(work))
         return seen, roads, settled

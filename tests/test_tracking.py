@@ -67,21 +67,16 @@ def test_parked_cars_keep_their_ids_and_places_as_the_ego_passes() -> None:
 
 
 def test_prediction_depends_on_the_motion_state() -> None:
-    """(1-sigma of position, speed) of a parked and a moving car, without and with the motion state."""
-    found = {}
-    for sigma_mps in (1e3, TrackingConfig().sigma_standing_mps):
-        drive = Drive(TrackingConfig(sigma_standing_mps=sigma_mps), noise_px=0.5)
-        for k in range(30):
-            parked, drives = SE2(45.0, -5.0), SE2(20.0 + 1.4 * k, 4.0)
-            seen = drive.step(SE2(0.8 * k, 0.0, 0.0), [parked, drives])
-        by_side = sorted(seen, key=lambda track: float(track.state[1]))
-        assert [track.is_stationary for track in by_side] == [True, False]
-        found[sigma_mps] = [(math.sqrt(track.cov[2, 2]), float(track.state[2])) for track in by_side]
-    (parked_before, drives_before), (parked_now, drives_now) = found.values()
-    assert parked_now[0] < 0.9 * parked_before[0]
-    assert abs(parked_now[1]) < 1.0
-    assert drives_now == pytest.approx(drives_before, abs=0.01)  # they share a road
-    assert drives_now[1] == pytest.approx(14.0, abs=2.0)
+    """A parked car keeps its position, a moving one its speed."""
+    drive = Drive(noise_px=0.5)
+    for k in range(30):
+        parked, drives = SE2(45.0, -5.0), SE2(20.0 + 1.4 * k, 4.0)
+        seen = drive.step(SE2(0.8 * k, 0.0, 0.0), [parked, drives])
+    stands, moves = sorted(seen, key=lambda track: float(track.predicted_m[1]))
+    assert (stands.is_stationary, moves.is_stationary) == (True, False)
+    assert stands.velocity_mps.tolist() == [0.0, 0.0]
+    assert moves.velocity_mps[0] == pytest.approx(14.0, abs=2.0)
+    assert stands.kinematic_cov[2, 2] < moves.kinematic_cov[2, 2]
 
 
 def test_a_gap_shorter_than_forget_s_keeps_the_id() -> None:
@@ -121,7 +116,7 @@ def test_heading_of_an_oncoming_car_follows_its_motion() -> None:
         tracks = drive.step(SE2(), [SE2(45.0 - 1.0 * k, 3.5, math.pi)])
     (track,) = tracks
     assert abs(wrap(track.yaw_rad - math.pi)) < 0.15
-    assert track.state[2] == pytest.approx(-10.0, abs=1.5)
+    assert track.velocity_mps[0] == pytest.approx(-10.0, abs=1.5)
 
 
 def test_crossing_cars_do_not_swap_ids() -> None:
@@ -130,7 +125,7 @@ def test_crossing_cars_do_not_swap_ids() -> None:
     for k in range(45):
         cars = [SE2(18.0, -8.0 + 0.4 * k, math.pi / 2), SE2(30.0, 8.0 - 0.4 * k, -math.pi / 2)]
         for track in drive.step(SE2(), cars):
-            history.setdefault(track.number, []).append(float(track.state[0]))
+            history.setdefault(track.number, []).append(float(track.predicted_m[0]))
     assert len(history) == 2
     for depths in history.values():
         assert np.ptp(depths) < 4.0
@@ -208,7 +203,7 @@ def test_stationary_vehicle_keeps_its_yaw_while_size_is_estimated() -> None:
     assert track.is_stationary
     assert drive.tracker.placing.users.stationary_probability()[drive.tracker.tracks.index(track)] > 0.9
     assert track.yaw_rad == 0.0
-    assert math.hypot(track.state[0] - 65.0, track.state[1] - 4.0) < 1.0
+    assert math.hypot(track.predicted_m[0] - 65.0, track.predicted_m[1] - 4.0) < 1.0
 
 
 def test_unusual_size_keeps_its_id_while_size_is_estimated() -> None:
@@ -298,7 +293,8 @@ def test_car_is_not_associated_with_objects_behind_it(label: str) -> None:
     drive = Drive()
     ego, car = SE2(), SE2(30.0, 0.5, 0.0)
     known = [drive.step(ego, [car]) for _ in range(10)][-1][0]
-    before_m, plain = known.pose().x_m, box_px(car)
+    users = drive.tracker.placing.users
+    before_m, plain = float(users.moments().mean[0, 0]), box_px(car)
     assert plain is not None
     higher = np.add(plain, [-5.0, -0.7 * (plain[3] - plain[1]), 5.0, 0.0])
     seen = observe_boxes(
@@ -309,7 +305,8 @@ def test_car_is_not_associated_with_objects_behind_it(label: str) -> None:
     assert shown == []
     drive.frame += 1
     (again,) = [track for track in drive.step(ego, [car]) if track.number == known.number]
-    assert again.pose().x_m == pytest.approx(before_m, abs=1.0)  # the road learns of the odd boxes too
+    row = drive.tracker.tracks.index(again)
+    assert users.moments().mean[row, 0] == pytest.approx(before_m, abs=1.0)  # the road learns of the odd boxes too
 
 
 def test_each_filter_has_exactly_one_row_per_track() -> None:

@@ -31,9 +31,8 @@ def predict_boxes_px(
     boxes = np.full((len(tracks), 4), np.nan)
     if not tracks:
         return boxes
-    centres = np.array([track.state[:2] for track in tracks])
-    then = np.array([in_ego(track.frame.T_world_ego, track.state[:2]) for track in tracks])
-    step = T_world_ego.inverse() @ centres - then
+    then = np.array([track.place.centre_m for track in tracks])
+    step = T_world_ego.inverse() @ np.array([track.predicted_m for track in tracks]) - then
     depth = np.array([track.place.depth_m for track in tracks])
     ahead = depth + step[:, 0] >= MIN_DISTANCE_M
     if not ahead.any():

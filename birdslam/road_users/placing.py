@@ -97,7 +97,7 @@ class Assignment:
         if self.track is None:
             return self.observation.depth_by_height_m
         reach_m = float(self.track.place.centre_m[0]) - self.track.place.depth_m
-        return max(MIN_DISTANCE_M, in_ego(T_world_ego, self.track.state[:2])[0] - reach_m)
+        return max(MIN_DISTANCE_M, in_ego(T_world_ego, self.track.predicted_m)[0] - reach_m)
 
     def turned_rad(self, T_world_ego: SE2) -> float:
         """Rotation over the ground of the line of sight since the last observation."""

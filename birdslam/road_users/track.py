@@ -20,13 +20,11 @@ class TrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Parameters of association and of the motion model."""
 
     min_iou: float = 0.15  # with the predicted box
-    gate_sigma: float = 3.0  # Mahalanobis gate in bird's-eye view
     birth_score: float = 0.5  # minimum score of a detection to start a track
     confirm_hits: int = 2  # number of detections until a track gets its id
     forget_unconfirmed_s: float = 0.25  # without a detection, of a track without an id
     forget_s: float = 1.0  # without a detection, of a track with an id
     sigma_accel_mps2: float = 3.0  # 1-sigma of a vehicle's acceleration
-    sigma_birth_mps: float = 8.0  # 1-sigma of the velocity of a new track
     moving_mps: float = 2.0  # minimum speed for a yaw by motion
     moving_sigma: float = 3.0  # and minimum significance of the speed
     moving_of_ego: float = 0.3  # and minimum fraction of the ego speed: ground errors look like motion
@@ -39,7 +37,6 @@ class TrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sigma_yaw_moving_rad: float = 0.1  # minimum of a CV edge's yaw after it is measured
     heading: HeadingConfig = HeadingConfig()
     standing_probability: float = 0.5  # above which motion does not correct the yaw
-    sigma_standing_mps: float = 2.0  # of the zero-velocity update: the vehicle may start
     late_sigma_m: float = 3.0  # maximum position sigma of a late detection for an edge in the current frame
 
 
@@ -86,15 +83,16 @@ class Track:
 
 @dataclass(kw_only=True)
 class VehicleTrack(Track):
-    """One vehicle; `state` is (x_m, y_m, vx_mps, vy_mps) of its centre in the odometry world, `cov` (4, 4)."""
+    """One vehicle as of `frame`; yaw, velocity and first position are in the odometry world."""
 
-    state: NDArray[np.float64]
-    cov: NDArray[np.float64]
     yaw_rad: float
     observation: Observation  # last observation
     place: Place  # its place in the ego of `frame`
     first_m: NDArray[np.float64]  # (2,) first position in the odometry world
     first_offset_m: NDArray[np.float64]  # (2,) from the ego to it, in world axes
+    velocity_mps: NDArray[np.float64]  # (2,)
+    kinematic_cov: NDArray[np.float64]  # (4, 4) of position and velocity by `user_filter`
+    predicted_m: NDArray[np.float64]  # (2,) position at the newest frame by constant velocity
     last_edge: LastEdge | None = None  # None before the track has an id
     sigma_yaw_rad: float = 0.0  # of a yaw measured by motion or body
     is_yaw_known: bool = False
@@ -111,8 +109,8 @@ class VehicleTrack(Track):
         return self.label if label == self.label else _most_voted(self.votes + Counter((label,)))
 
     def pose(self) -> SE2:
-        """T_world_vehicle in the odometry's world."""
-        return SE2(float(self.state[0]), float(self.state[1]), self.yaw_rad)
+        """T_world_vehicle in the odometry's world, predicted to the newest frame."""
+        return SE2(float(self.predicted_m[0]), float(self.predicted_m[1]), self.yaw_rad)
 
 
 def _most_voted(votes: Counter[str]) -> str:

@@ -20,6 +20,7 @@ from birdslam.geometry.se2 import SE2, wrap
 from birdslam.perception import DepthMap, Detections
 from birdslam.road_users.association import MAX_SQUARED_SIGMAS, assign_track_ids, match_track_ids, predict_boxes_px
 from birdslam.road_users.life_cycle import LifeCycle
+from birdslam.road_users.models.user_state import KINEMATIC, VELOCITY
 from birdslam.road_users.placement.depth_fusion import DepthPlace, PseudoLidarConfig
 from birdslam.road_users.placement.localisation import (
     LocalisationConfig,
@@ -41,11 +42,10 @@ Floats = NDArray[np.float64]
 
 
 class Tracker:
-    """A constant-velocity Kalman filter for each vehicle.
+    """Associates boxes with vehicles, and keeps the place, velocity and yaw of each.
 
-    State: x, y (m) and vx, vy (m/s) of the centre in the odometry world (dead reckoning since the start). Measurement:
-    the centre (m) in ego from `placing.Placing`, with its covariance. Readers: association and placing in the next
-    frame, `yaw_filter.YawFilter`, and `vehicle_edges`. Planners read the pose graph instead.
+    Readers: association and placing in the next frame, `yaw_filter.YawFilter`, and `vehicle_edges`. Planners read the
+    pose graph instead.
     """
 
     def __init__(
@@ -131,10 +131,6 @@ class Tracker:
         self._reclassify(assignments, frame.T_world_ego)
         places = self.placing.locate(assignments, frame.T_world_ego)
         self._correct(assignments, places, frame)
-        for assignment, where in zip(assignments, places, strict=True):
-            if assignment.track is None:
-                self.tracks.append(self._start_track(assignment, where, frame))
-                self.yaw.correct_by_outline(assignment.row, self.tracks[-1], self.placing.yaw_by_outline)
         self.life.delete_lost(frame.t_source_ns)
         return self.life.confirm(frame, lambda track: track.observation.track_id)
 
@@ -143,15 +139,8 @@ class Tracker:
         dt_s = max(0.0, (frame.t_source_ns - last.t_source_ns) * 1e-9)
         self.yaw.predict(dt_s, last.T_world_ego.between(frame.T_world_ego))
         self.placing.predict(dt_s, frame.T_world_ego, frame.step_cov)
-        F = np.eye(4)
-        F[0, 2] = F[1, 3] = dt_s
-        G = np.array([[dt_s**2 / 2, 0.0], [0.0, dt_s**2 / 2], [dt_s, 0.0], [0.0, dt_s]])
-        Q = G @ G.T * self.config.sigma_accel_mps2**2
-        if self.tracks:
-            states = np.array([track.state for track in self.tracks]) @ F.T
-            covs = F @ np.array([track.cov for track in self.tracks]) @ F.T + Q
-            for track, state, cov in zip(self.tracks, states, covs, strict=True):
-                track.state, track.cov = state, cov
+        for track in self.tracks:
+            track.predicted_m = track.predicted_m + dt_s * track.velocity_mps
         self._last = frame
 
     def _assignments(
@@ -204,54 +193,34 @@ class Tracker:
         return self.life.associate(-more, (more >= 0.0) & (squared[0] <= MAX_SQUARED_SIGMAS), 0.0)
 
     def _correct(self, assignments: Sequence[Assignment], places: Sequence[Place], frame: EgoFrame) -> None:
-        """Updates the known tracks by the places of their observations, all at once."""
-        known = [(a.track, a, place) for a, place in zip(assignments, places, strict=True) if a.track is not None]
-        if not known:
+        """Updates the tracks by the places of their observations; starts those of new vehicles."""
+        if not assignments:
             return
-        state = np.array([track.state for track, *_ in known])
-        cov = np.array([track.cov for track, *_ in known])
-        R = frame.T_world_ego.rotation()
-        R_seen = R @ np.array([seen.cov for *_, seen in known]) @ R.T
-        S = cov[:, :2, :2] + R_seen
-        innovation = frame.T_world_ego @ np.array([seen.centre_m for *_, seen in known]) - state[:, :2]
-        information = np.linalg.inv(S)
-        nis = np.einsum("na,nab,nb->n", innovation, information, innovation).tolist()
-        gain = cov[:, :, :2] @ information
-        corrected = state + (gain @ innovation[..., None])[..., 0]
-        corrected_cov = cov - gain @ S @ gain.swapaxes(1, 2)
-        standing = self.placing.users.stationary_probability()[[a.row for _, a, _ in known]]
-        is_stationary = standing > self.config.standing_probability
-        self._zero_velocity_update(corrected, corrected_cov, is_stationary)
-        for k, (track, assignment, seen) in enumerate(known):
+        stationary = self.placing.users.stationary_probability() > self.config.standing_probability
+        moments = self.placing.users.moments(stands=stationary)
+        for a, place in zip(assignments, places, strict=True):
+            velocity_mps, cov = moments.mean[a.row, VELOCITY], moments.cov[a.row, KINEMATIC, KINEMATIC]
+            if a.track is None:
+                self.tracks.append(self._start_track(a, place, frame, velocity_mps, cov))
+                self.yaw.correct_by_outline(a.row, self.tracks[-1], self.placing.yaw_by_outline)
+                continue
+            track = a.track
             track.motion = self._predicted_motion(track, frame)
-            track.is_stationary = bool(is_stationary[k])
-            if track.is_stationary and nis[k] > self.config.gate_sigma**2:
-                # The size was re-estimated, which moves the place without a motion
-                track.state[:2] += innovation[k]
-                track.first_m = track.first_m + innovation[k]
-                track.cov[:2, :], track.cov[2:, :2] = 0.0, 0.0
-                track.cov[:2, :2] = R_seen[k]
-            else:
-                track.state, track.cov = corrected[k], corrected_cov[k]
-            track.observation, track.place = assignment.observation, seen
-            self.life.observe(track, frame, assignment.observation.label)
-            self.yaw.correct_by_motion(assignment.row, track)
-            self.yaw.correct_by_body(assignment.row, track, assignment.by_depth)
-            self.yaw.correct_by_outline(assignment.row, track, self.placing.yaw_by_outline)
-
-    def _zero_velocity_update(self, states: Floats, covs: Floats, which: NDArray[np.bool_]) -> None:
-        """Zero-velocity update of `which` of the states (N, 4), in place."""
-        velocity_cov = covs[which, 2:, 2:] + np.eye(2) * self.config.sigma_standing_mps**2
-        gain = covs[which, :, 2:] @ np.linalg.inv(velocity_cov)
-        states[which] -= (gain @ states[which, 2:, None])[..., 0]
-        covs[which] -= gain @ covs[which, 2:]
+            track.is_stationary = bool(stationary[a.row])
+            track.velocity_mps, track.kinematic_cov = velocity_mps, cov
+            track.observation, track.place = a.observation, place
+            track.predicted_m = frame.T_world_ego @ place.centre_m
+            self.life.observe(track, frame, a.observation.label)
+            self.yaw.correct_by_motion(a.row, track)
+            self.yaw.correct_by_body(a.row, track, a.by_depth)
+            self.yaw.correct_by_outline(a.row, track, self.placing.yaw_by_outline)
 
     def _predicted_motion(self, track: VehicleTrack, frame: EgoFrame) -> MotionEdge | None:
         """VV edge by constant velocity; None for a track without a CV edge."""
         if track.last_edge is None:
             return None
         dt_s = (frame.t_source_ns - track.last_edge.t_ns) * 1e-9
-        xx, xy, yy = in_vehicle_axes(track.cov[2:, 2:], track.yaw_rad)
+        xx, xy, yy = in_vehicle_axes(track.kinematic_cov[2:, 2:], track.yaw_rad)
         by_acceleration = (self.config.sigma_accel_mps2 * dt_s**2 / 2.0) ** 2
         xx, xy, yy = xx * dt_s**2 + by_acceleration, xy * dt_s**2, yy * dt_s**2 + by_acceleration
         return MotionEdge(
@@ -262,23 +231,22 @@ class Tracker:
             cov=(xx, xy, 0.0, xy, yy, 0.0, 0.0, 0.0, (self.config.sigma_yaw_rate_radps * dt_s) ** 2),
         )
 
-    def _start_track(self, assignment: Assignment, seen: Place, frame: EgoFrame) -> VehicleTrack:
+    def _start_track(
+        self, assignment: Assignment, seen: Place, frame: EgoFrame, velocity_mps: Floats, kinematic_cov: Floats
+    ) -> VehicleTrack:
         observation, by_depth = assignment.observation, assignment.by_depth
         if by_depth is not None and not by_depth.has_front:
             by_depth = None
         T_world_ego = frame.T_world_ego
-        R = T_world_ego.rotation()
-        cov = np.zeros((4, 4))
-        cov[:2, :2] = R @ seen.cov @ R.T
-        cov[2:, 2:] = np.eye(2) * self.config.sigma_birth_mps**2
         return VehicleTrack(
-            state=np.concatenate([T_world_ego @ seen.centre_m, np.zeros(2)]),
-            cov=cov,
             yaw_rad=wrap(T_world_ego.yaw_rad + assignment.yaw_rad(T_world_ego, self.config.heading)),
             observation=observation,
             place=seen,
             first_m=T_world_ego @ seen.centre_m,
-            first_offset_m=R @ seen.centre_m,
+            first_offset_m=T_world_ego.rotation() @ seen.centre_m,
+            velocity_mps=velocity_mps,
+            kinematic_cov=kinematic_cov,
+            predicted_m=T_world_ego @ seen.centre_m,
             frame=frame,
             votes=Counter({observation.label: 1}),
             sigma_yaw_rad=0.0 if by_depth is None else by_depth.sigma_yaw_rad,

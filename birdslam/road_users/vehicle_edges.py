@@ -67,17 +67,16 @@ def _extrapolated(
     None if a vehicle left the view or its velocity is too uncertain.
     """
     dt_s, T_world_then = (present.t_source_ns - tracks[0].frame.t_source_ns) * 1e-9, tracks[0].frame.T_world_ego
-    state, cov = np.array([track.state for track in tracks]), np.array([track.cov for track in tracks])
-    steps = state[:, 2:] * dt_s
-    drift = cov[:, 2:, 2:] * dt_s**2 + np.eye(2) * (config.sigma_accel_mps2 * dt_s**2 / 2.0) ** 2
-    state[:, :2] += steps
-    moved = [replace(track, state=moved_to) for track, moved_to in zip(tracks, state, strict=True)]
+    steps = np.array([track.velocity_mps for track in tracks]) * dt_s
+    cov = np.array([track.kinematic_cov for track in tracks])
+    drift = cov[:, 2:, 2:] * dt_s**2
+    drift += np.eye(2) * (config.sigma_accel_mps2 * dt_s**2 / 2.0) ** 2
+    moved = [replace(track, predicted_m=track.predicted_m + step) for track, step in zip(tracks, steps, strict=True)]
     boxes = predict_boxes_px(moved, camera, present.T_world_ego, ground)
     known = (np.linalg.eigvalsh(drift)[:, -1] <= config.late_sigma_m**2) & np.isfinite(boxes).all(axis=1)
     R_world_then, R_now_world = T_world_then.rotation(), present.T_world_ego.rotation().T
-    # The velocity error is correlated with that of the place that corrected it; K R is the posterior's block
     places_cov = R_world_then @ np.array([track.place.cov for track in tracks]) @ R_world_then.T + drift
-    places_cov += dt_s * (cov[:, 2:, :2] + cov[:, :2, 2:])
+    places_cov += dt_s * (cov[:, 2:, :2] + cov[:, :2, 2:])  # the boxes that gave the velocity gave the place
     places_cov = R_now_world @ places_cov @ R_now_world.T
     centres = np.array([track.place.centre_m for track in tracks])
     centres = present.T_world_ego.inverse() @ (T_world_then @ centres + steps)

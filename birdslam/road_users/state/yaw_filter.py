@@ -43,9 +43,9 @@ class YawFilter:
         """Corrects the yaw by the direction of a significant motion."""
         if track.is_stationary or track.observation.is_cut_at_side:
             return
-        vx, vy = track.state[2:].tolist()
+        vx, vy = track.velocity_mps.tolist()
         speed = math.hypot(vx, vy)
-        sigma = math.sqrt(max(float(track.cov[2, 2] + track.cov[3, 3]) / 2.0, 1e-12))
+        sigma = math.sqrt(max(float(np.trace(track.kinematic_cov[2:, 2:])) / 2.0, 1e-12))
         config = self.config
         slowest = max(config.moving_mps, config.moving_sigma * sigma, config.moving_of_ego * self._ego_speed_mps)
         if speed < slowest or not self._has_moved(track):
@@ -101,14 +101,13 @@ class YawFilter:
         (x, y, *_), (x0, y0, *_) = (centre_at(seen, depth_m, yaw_rad, self.localisation) for yaw_rad in yaws_rad)
         shift_m = SE2(yaw_rad=ego_yaw_rad) @ SE2(x - x0, y - y0)
         shift_world_m = np.array([shift_m.x_m, shift_m.y_m])
-        track.state[:2] += shift_world_m
-        track.first_m = track.first_m + shift_world_m
+        track.predicted_m, track.first_m = track.predicted_m + shift_world_m, track.first_m + shift_world_m
         track.place = msgspec.structs.replace(track.place, centre_m=track.place.centre_m + np.array([x - x0, y - y0]))
 
     def _has_moved(self, track: VehicleTrack) -> bool:
         """Whether it has moved significantly from its first place."""
         x, y = track.first_offset_m.tolist()
-        dx, dy = (track.state[:2] - track.first_m).tolist()
+        dx, dy = (track.predicted_m - track.first_m).tolist()
         distance2 = x * x + y * y
         along, across = (x * dx + y * dy) / distance2, (x * dy - y * dx) / distance2
         return math.hypot(along / self.config.moved_along_rel, across / self.config.moved_across_rel) > 1.0
