@@ -13,9 +13,11 @@ import pytest
 
 from birdslam.bench.lanes import line_masks
 from birdslam.bench.lanes.kitti_road import LANE, Still
+from birdslam.bench.lanes.later_lanes import LaterLanes
 from birdslam.bench.lanes.true_borders import Borders, BorderScores, TrueBorders, read_borders, text_of
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
+from birdslam.geometry.se2 import SE2
 from birdslam.lanes.borders import border_points
 from birdslam.lanes.line_filter import LineFilter
 from birdslam.lanes.outline import line_px
@@ -24,7 +26,7 @@ from birdslam.lanes.road_view import RoadView, road_view
 from birdslam.lanes.topology import LaneRow
 from birdslam.perception import Segmentation
 from birdslam.sources.recording import DatasetError, RecordedFrame, Recording
-from birdslam.types import Lane, LaneLine, Lanes, LineKind
+from birdslam.types import Estimate, Lane, LaneChange, LaneLine, Lanes, LineKind
 
 CAMERA = Camera(640, 240, 420.0, 420.0, 319.5, 90.0, height_m=1.5)
 COV = tuple(np.diag([0.01, 1e-5, 1e-8, 1e-12]).ravel().tolist())
@@ -136,6 +138,51 @@ def test_a_yaw_turns_traced_borders() -> None:
     line = [(0.0, 0.0), (60.0, 0.0)]
     left, _ = TrueBorders(Straight(), Borders(line, line, yaw_rad=0.01)).borders_m(0)
     assert float(np.interp(20.0, left[:, 0], left[:, 1])) == pytest.approx(0.2, abs=0.01)  # the camera looks right
+
+
+def later(lanes: dict[int, Lanes], change: int = -1, valid: bool = True) -> LaterLanes:
+    """60 m straight ahead in steps of 1 m, with a lane from -2 to 1.5 m where `lanes` has no other."""
+    out = LaterLanes()
+    for k in range(61):
+        own = lanes.get(k, lanes_of(1.5, -2.0))
+        if k == change:
+            own = msgspec.structs.replace(own, change=LaneChange.LEFT)
+        pose = SE2(1.01 * k, 0.0, 0.0)
+        cov = tuple(np.eye(3).ravel().tolist())
+        out.add(
+            Estimate(
+                epoch=0,
+                frame_id=k,
+                t_source_ns=k,
+                t_capture_ns=k,
+                t_utc_ns=k,
+                T_world_ego=pose,
+                cov=cov,
+                valid=valid or k < 20,
+                lanes=own,
+            )
+        )
+    return out
+
+
+def test_a_lane_against_that_which_is_found_later() -> None:
+    scores, worst = later({3: lanes_of(1.9, -2.0)}).scores(2)
+    report = scores.report("straight")
+    assert worst[0] == 3
+    assert [at.error_median_m for at in report.ranges] == pytest.approx([0.0, 0.0, 0.0], abs=1e-9)
+    assert scores.errors[30.0][1][:2] == pytest.approx((0.4, 0.0), abs=1e-9)
+    assert report.ranges[2].frames == 61 - 2 - 24  # 6 m ahead of the last frame the road is unknown
+    assert later({}).scores(30)[0].report("straight").frames == 61 - 30 - 4
+
+
+def test_lanes_are_not_compared_across_a_change_a_gap_or_invalid_frames() -> None:
+    others = {k: lanes_of(5.0, 1.5) for k in range(30, 61)}
+    gap = {k: Lanes() for k in range(30, 36)}
+    for drive in (later(others, change=30), later(gap), later(others, valid=False)):
+        scores, _ = drive.scores(0)
+        for x_m, errors in scores.errors.items():
+            assert max((max(off[:2]) for off in errors), default=0.0) == pytest.approx(0.0, abs=1e-9), x_m
+    assert len(later(gap).scores(0)[0].errors[30.0]) < len(later({}).scores(0)[0].errors[30.0])
 
 
 def test_borders_need_poses_and_a_sound_file(tmp_path: Path) -> None:

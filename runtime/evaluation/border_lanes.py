@@ -1,9 +1,10 @@
-"""Compares the ego lane of a real drive with its traced borders, in single images and with the line tracker."""
+"""Compares the ego lane of a real drive with its traced borders, or with its own lane when the ego gets there."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+from birdslam.bench.lanes.later_lanes import LaterLanes
 from birdslam.bench.lanes.true_borders import START_S, BorderScores, BordersReport, TrueBorders, read_borders
 from birdslam.outputs.drive_files import claim_directory, write_json
 from birdslam.runtime.configuration import Configuration, complete
@@ -49,3 +50,27 @@ def evaluate_borders(configuration: Configuration, drive: str, file: Path) -> Bo
     report = scores.report(recording.name)
     write_json(output / "report.json", report)
     return report
+
+
+def evaluate_later(configuration: Configuration, drive: str) -> tuple[BordersReport, list[int]]:
+    """Processes any drive, and compares its lanes with those of later frames; writes report.json to the output.
+
+    Also returns the worst frames. Raises ConfigurationError, DatasetError, ModelError, ResultsError.
+    """
+    configuration = configuration.as_lossless()
+    recording = open_recorded(recording_uri(drive), configuration.camera, configuration.source.stride)
+    output = Path(configuration.output)
+    claim_directory(output)
+    source, later = RecordedSource(recording, configuration.source), LaterLanes()
+    with (
+        Inference(complete(configuration, recording.camera, source.rate_hz)) as inference,
+        Progress(recording.name, len(recording)) as progress,
+    ):
+        slam = BirdSLAM(recording.camera, inference.networks, configuration.slam, lane_head=inference.lane_head)
+        for frame in offline_frames(source):
+            later.add(slam.step(frame)[1])
+            progress.advance()
+    scores, worst = later.scores(int(START_S * recording.rate_hz))
+    report = scores.report(recording.name)
+    write_json(output / "report.json", report)
+    return report, worst

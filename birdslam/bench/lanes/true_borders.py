@@ -162,13 +162,13 @@ class BorderScores:
     errors: dict[float, list[tuple[float, float, float]]] = field(default_factory=lambda: {x: [] for x in RANGES_M})
 
     def add(self, lanes: Lanes | None, left: Floats, right: Floats) -> None:
-        """Adds a frame of the tracker: its lanes and the true borders (N, 3)."""
+        """Adds a frame of the tracker: its lanes and the true borders (N, 2 or 3), from near to far."""
         own = None if lanes is None else lanes.ego
         self.has_lane.append(own is not None)
         if own is None:
             return
         for x in RANGES_M:
-            if x > own.to_m:
+            if x > min(own.to_m, left[-1, 0], right[-1, 0]):
                 continue
             true = [float(np.interp(x, border[:, 0], border[:, 1])) for border in (left, right)]
             off = own.left_m(x) - true[0], own.right_m(x) - true[1]
@@ -203,9 +203,10 @@ def _range_of(x_m: float, errors: list[tuple[float, float, float]]) -> BorderRan
 
 def text_of(report: BordersReport) -> str:
     """Lines for a terminal."""
+    images = f"{report.images} single images: mean IoU of the ego lane {number(report.iou_mean, 3)}, "
+    images += f"{number(report.iou_low)} below {LOW_IOU}"
     out = [
-        f"{report.drive}: {report.images} single images: mean IoU of the ego lane {number(report.iou_mean, 3)}, "
-        f"{number(report.iou_low)} below {LOW_IOU}",
+        f"{report.drive}: {images}" if report.images else f"{report.drive}:",
         f"  {report.frames} frames after {START_S:g} s: ego lane in {number(report.with_lane)}, "
         f"false in {number(report.false)} of these",
     ]

@@ -10,13 +10,13 @@ from birdslam.bench.lanes.paint_masks import PaintReport
 from birdslam.bench.lanes.true_borders import text_of as borders_text
 from birdslam.runtime.cli.arguments import add_config, add_pipeline
 from birdslam.runtime.configuration import ConfigurationError
-from birdslam.runtime.evaluation.border_lanes import evaluate_borders
+from birdslam.runtime.evaluation.border_lanes import evaluate_borders, evaluate_later
 from birdslam.runtime.evaluation.drive_lanes import DriveReport, evaluate_drive
 from birdslam.runtime.evaluation.lanes import draw_frame_lanes
 from birdslam.runtime.evaluation.still_lanes import REPORT, evaluate_line_masks, evaluate_paint, evaluate_stills
 from birdslam.runtime.options import configuration_of
 
-BORDERS, KITTI_ROAD, LINES, LINE_MASKS, PAINT = "borders", "kitti-road", "lines", "line-masks", "paint"
+BORDERS, KITTI_ROAD, LATER, LINES, LINE_MASKS, PAINT = "borders", "kitti-road", "later", "lines", "line-masks", "paint"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,7 +29,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text += "paint: DIR has imgs/NAME.png and masks/NAME.png of lane markings, as in comma10k"
     text += "; line-masks: DIR has image_N.jpg with masks lines_N.png, as TuSimple"
     text += "; borders: DRIVE has true poses, and --borders has the borders of its lane"
-    parser.add_argument("--truth", choices=(BORDERS, KITTI_ROAD, LINES, LINE_MASKS, PAINT), help=text)
+    text += "; later: the lane of DRIVE ahead, with that which is found there later"
+    parser.add_argument("--truth", choices=(BORDERS, KITTI_ROAD, LATER, LINES, LINE_MASKS, PAINT), help=text)
     text = "left and right border of the ego lane: distance travelled and left offset, metres (JSON)"
     parser.add_argument("--borders", type=Path, metavar="FILE", help=text)
     add_config(parser)
@@ -44,6 +45,10 @@ def run(options: argparse.Namespace) -> int:
     if options.truth == BORDERS:
         print(borders_text(evaluate_borders(configuration, options.drive, options.borders)))
         return 0
+    if options.truth == LATER:
+        report, worst = evaluate_later(configuration, options.drive)
+        print(f"{borders_text(report)}\n  worst frames: {', '.join(map(str, worst))}")
+        return 0
     if options.truth == LINES:
         print(_text(evaluate_drive(configuration, options.drive)))
         return 0
@@ -56,11 +61,11 @@ def run(options: argparse.Namespace) -> int:
     if options.truth is None:
         print(draw_frame_lanes(configuration, options.drive, options.frame))
         return 0
-    report = evaluate_stills(configuration, Path(options.drive))
-    for found in report.by_image:
+    stills = evaluate_stills(configuration, Path(options.drive))
+    for found in stills.by_image:
         width = "no lane" if found.width_m is None else f"{found.width_m:.2f} m between {found.left} and {found.right}"
         print(f"{found.image:16} IoU {found.ego_lane_iou:.3f}: {width}")
-    print(f"{report.images} images: mean IoU of the ego lane {report.ego_lane_iou_mean:.3f}")
+    print(f"{stills.images} images: mean IoU of the ego lane {stills.ego_lane_iou_mean:.3f}")
     print(Path(configuration.output) / REPORT)
     return 0
 
