@@ -27,9 +27,6 @@ class TrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sigma_accel_mps2: float = 3.0  # 1-sigma of a vehicle's acceleration
     moving_mps: float = 2.0  # minimum speed for a yaw by motion
     moving_sigma: float = 3.0  # and minimum significance of the speed
-    moving_of_ego: float = 0.3  # and minimum fraction of the ego speed: ground errors look like motion
-    moved_along_rel: float = 0.15  # and minimum displacement along the line of sight, as a fraction of the first
-    moved_across_rel: float = 0.05  # distance; and across the line of sight
     sigma_yaw_rate_radps: float = 0.5  # 1-sigma of a vehicle's turning
     direction_inflation: float = 3.0  # of the direction's sigma: its errors are correlated over frames
     body_yaw_inflation: float = 3.0  # of the sigma of a yaw from a network, for the same reason
@@ -83,13 +80,11 @@ class Track:
 
 @dataclass(kw_only=True)
 class VehicleTrack(Track):
-    """One vehicle as of `frame`; yaw, velocity and first position are in the odometry world."""
+    """One vehicle as of `frame`; yaw and velocity are in the odometry world."""
 
     yaw_rad: float
     observation: Observation  # last observation
     place: Place  # its place in the ego of `frame`
-    first_m: NDArray[np.float64]  # (2,) first position in the odometry world
-    first_offset_m: NDArray[np.float64]  # (2,) from the ego to it, in world axes
     velocity_mps: NDArray[np.float64]  # (2,)
     kinematic_cov: NDArray[np.float64]  # (4, 4) of position and velocity by `user_filter`
     predicted_m: NDArray[np.float64]  # (2,) position at the newest frame by constant velocity

@@ -137,7 +137,7 @@ class Tracker:
     def _predict(self, frame: EgoFrame) -> None:
         last = frame if self._last is None else self._last
         dt_s = max(0.0, (frame.t_source_ns - last.t_source_ns) * 1e-9)
-        self.yaw.predict(dt_s, last.T_world_ego.between(frame.T_world_ego))
+        self.yaw.predict(dt_s)
         self.placing.predict(dt_s, frame.T_world_ego, frame.step_cov)
         for track in self.tracks:
             track.predicted_m = track.predicted_m + dt_s * track.velocity_mps
@@ -242,8 +242,6 @@ class Tracker:
             yaw_rad=wrap(T_world_ego.yaw_rad + assignment.yaw_rad(T_world_ego, self.config.heading)),
             observation=observation,
             place=seen,
-            first_m=T_world_ego @ seen.centre_m,
-            first_offset_m=T_world_ego.rotation() @ seen.centre_m,
             velocity_mps=velocity_mps,
             kinematic_cov=kinematic_cov,
             predicted_m=T_world_ego @ seen.centre_m,

@@ -31,12 +31,9 @@ class YawFilter:
         self.ground_size = ground_size
         self.localisation = localisation
         self._dt_s = 0.0
-        self._ego_speed_mps = 0.0
 
-    def predict(self, dt_s: float, step: SE2) -> None:
-        """Predicts to the next frame, `dt_s` later, after the ego motion `step`."""
-        if dt_s > 0.0:
-            self._ego_speed_mps = math.hypot(step.x_m, step.y_m) / dt_s
+    def predict(self, dt_s: float) -> None:
+        """Predicts to the next frame, `dt_s` later."""
         self._dt_s = dt_s
 
     def correct_by_motion(self, row: int, track: VehicleTrack) -> None:
@@ -47,8 +44,7 @@ class YawFilter:
         speed = math.hypot(vx, vy)
         sigma = math.sqrt(max(float(np.trace(track.kinematic_cov[2:, 2:])) / 2.0, 1e-12))
         config = self.config
-        slowest = max(config.moving_mps, config.moving_sigma * sigma, config.moving_of_ego * self._ego_speed_mps)
-        if speed < slowest or not self._has_moved(track):
+        if speed < max(config.moving_mps, config.moving_sigma * sigma):
             return
         turn = wrap(math.atan2(vy, vx) - track.yaw_rad)
         if track.is_yaw_known and abs(turn) > math.pi / 2.0:  # front and rear were swapped
@@ -100,14 +96,5 @@ class YawFilter:
         self.ground_size.rescale_outline(row, math.log(after / before_it))
         (x, y, *_), (x0, y0, *_) = (centre_at(seen, depth_m, yaw_rad, self.localisation) for yaw_rad in yaws_rad)
         shift_m = SE2(yaw_rad=ego_yaw_rad) @ SE2(x - x0, y - y0)
-        shift_world_m = np.array([shift_m.x_m, shift_m.y_m])
-        track.predicted_m, track.first_m = track.predicted_m + shift_world_m, track.first_m + shift_world_m
+        track.predicted_m = np.add(track.predicted_m, (shift_m.x_m, shift_m.y_m))
         track.place = msgspec.structs.replace(track.place, centre_m=track.place.centre_m + np.array([x - x0, y - y0]))
-
-    def _has_moved(self, track: VehicleTrack) -> bool:
-        """Whether it has moved significantly from its first place."""
-        x, y = track.first_offset_m.tolist()
-        dx, dy = (track.predicted_m - track.first_m).tolist()
-        distance2 = x * x + y * y
-        along, across = (x * dx + y * dy) / distance2, (x * dy - y * dx) / distance2
-        return math.hypot(along / self.config.moved_along_rel, across / self.config.moved_across_rel) > 1.0
