@@ -48,22 +48,39 @@ class CornersOfImage:
     t_s: float = 0.0
 
 
-def track_corners(images: Iterable[tuple[NDArray[np.uint8], Floats, float]], camera: Camera) -> list[CornersOfImage]:
-    """Tracks corners through raw images, given with the boxes (B, 4) of vehicles and the time in s.
+def track_corners(
+    images: Iterable[tuple[NDArray[np.uint8], Floats | None, float]], camera: Camera
+) -> list[CornersOfImage]:
+    """Tracks corners through raw images, given with the boxes (B, 4) of vehicles, None if not detected, and time in s.
 
-    Corners in boxes are left out; no corner continues after a gap in time. `camera` needs the image size and an
-    approximate focal length only.
+    Corners are left out that are in a box of their image, or of the detections before and after it. No corner continues
+    after a gap in time. `camera` needs the image size and an approximate focal length only.
     """
-    out: list[CornersOfImage] = []
+    tracked: list[CornersOfImage] = []
+    detected: list[Floats | None] = []
     resolution = WorkingResolution(camera)
     tracker = FeatureTracker(resolution.camera.width_px, resolution.camera.height_px, FeatureConfig())
     for image, boxes_px, t_s in images:
-        if out and not 0.0 <= t_s - out[-1].t_s <= _MAX_GAP_S:
+        if tracked and not 0.0 <= t_s - tracked[-1].t_s <= _MAX_GAP_S:
             tracker.drop_reference()
         tracks = tracker.track(resolution.image(image))
         tracker.accept(tracks)
-        static = outside(tracks.px, resolution.boxes_px(boxes_px))
-        out.append(CornersOfImage(tracks.ids[static], resolution.original_px(tracks.px[static]), t_s))
+        tracked.append(CornersOfImage(tracks.ids, tracks.px, t_s))
+        detected.append(None if boxes_px is None else resolution.boxes_px(boxes_px))
+    out: list[CornersOfImage] = []
+    for corners, before, after in zip(tracked, _last(detected), _last(detected[::-1])[::-1], strict=True):
+        boxes = [boxes_px for boxes_px in (before, after) if boxes_px is not None]
+        static = outside(corners.px, np.concatenate(boxes or [np.zeros((0, 4))]))
+        out.append(CornersOfImage(corners.ids[static], resolution.original_px(corners.px[static]), corners.t_s))
+    return out
+
+
+def _last(detected: Sequence[Floats | None]) -> list[Floats | None]:
+    """The last detection up to each image."""
+    last, out = None, list[Floats | None]()
+    for boxes_px in detected:
+        last = last if boxes_px is None else boxes_px
+        out.append(last)
     return out
 
 

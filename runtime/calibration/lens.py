@@ -31,6 +31,8 @@ from birdslam.runtime.nodes.inference import Inference
 from birdslam.runtime.nodes.sources import open_recorded
 from birdslam.types import NS_PER_S
 
+DETECTIONS_HZ = 8.0  # min. rate of the detector beside the tracking of corners
+
 
 class LensOfDrive(NamedTuple):
     """A lens, the corners behind it, and the pitch from the direction of travel if observable."""
@@ -116,15 +118,17 @@ def corners_of_drive(
     read = pieces(recording, configuration.source.frames)
     every = max(1, sum(map(len, read)) // MAX_IMAGES)
     with Inference(complete(configuration, raw, recording.rate_hz), boxes_only=True) as inference:
+        inference.networks.slowdown = max(1, int(recording.rate_hz / DETECTIONS_HZ))
 
-        def images() -> Iterator[tuple[NDArray[np.uint8], Floats, float]]:
+        def images() -> Iterator[tuple[NDArray[np.uint8], Floats | None, float]]:
             frames = read_pieces(recording, read, "lens")
             for index, (frame, pending) in enumerate(inference.networks.in_order(frames)):
                 if frame.image is not None:
                     if edges is not None and index % every == 0:
                         edges.append(find_vertical_edges(frame.image))
-                    found = pending.result().detections
-                    boxes_px = np.zeros((0, 4)) if found is None else found.boxes_px
+                    found = pending.result()
+                    detections = found.detections if found.ages.get("detector") == 0 else None
+                    boxes_px = None if detections is None else detections.boxes_px
                     yield frame.image, boxes_px, frame.t_source_ns / NS_PER_S
 
         return track_corners(images(), raw)
