@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,10 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from birdslam.geometry.camera import Camera
-from birdslam.perception import Networks, Segmentation
+from birdslam.perception import KeptFindings, Networks, Segmentation
 from birdslam.perception.decoding.multitask import Findings
 from birdslam.perception.manifest import Schedule
-from birdslam.runtime.calibration.kept import KeptResults
 from birdslam.runtime.calibration.pieces import READ_S, pieces, read_pieces
 from birdslam.sources.recording import RecordedFrame, Recording
 from birdslam.types import Frame
@@ -83,18 +83,30 @@ class _Masks:
         return Findings(segmentation=Segmentation(mask, ~mask))
 
 
-def test_second_pass_has_the_networks_results_of_the_first() -> None:
-    head = _Masks()
+def test_second_pass_has_the_networks_results_of_the_first(tmp_path: Path) -> None:
+    head, kept, passes = _Masks(), KeptFindings(), []
     with ThreadPoolExecutor(1) as threads:
-        results = KeptResults(Networks([head], threads.submit))
-        passes = []
-        for _ in range(2):
+        for number in range(3):
+            networks = Networks([head], threads.submit, kept=kept)
             frames = [Frame(k, k, k, 0, np.full((5, 7), k % 3, np.uint8)) for k in range(9)]
-            passes.append([pending.result() for _, pending in results.of_frames(frames)])
+            passes.append([pending.result() for _, pending in networks.in_order(frames)])
+            if number == 1:
+                kept.write(tmp_path / "findings")
+                kept = KeptFindings.read(tmp_path / "findings")
     assert head.runs == 5
-    for first, second in zip(*passes, strict=True):
-        assert (first.ages, first.status, first.detections) == (second.ages, second.status, second.detections)
-        assert first.segmentation is not None
-        assert second.segmentation is not None
-        np.testing.assert_array_equal(first.segmentation.road, second.segmentation.road)
-        np.testing.assert_array_equal(first.segmentation.lane, second.segmentation.lane)
+    for first, second, third in zip(*passes, strict=True):
+        for later in (second, third):
+            assert (first.ages, first.status, first.detections) == (later.ages, later.status, later.detections)
+            assert first.segmentation is not None
+            assert later.segmentation is not None
+            np.testing.assert_array_equal(first.segmentation.road, later.segmentation.road)
+            np.testing.assert_array_equal(first.segmentation.lane, later.segmentation.lane)
+
+
+def test_findings_of_another_image_are_not_used() -> None:
+    kept, at = KeptFindings(), {"name": "masks", "t_source_ns": 1}
+    for value in (0, 1):
+        found = kept.run(**at, run=_Masks().run, image=np.full((5, 7), value, np.uint8))
+        assert found is not None
+        assert found.segmentation is not None
+        assert found.segmentation.road.sum() == (18, 12)[value]

@@ -5,6 +5,7 @@ from birdslam.perception.decoding.depth import DepthMap
 from birdslam.perception.decoding.detection import Detections
 from birdslam.perception.decoding.multitask import Findings
 from birdslam.perception.decoding.segmentation import Segmentation
+from birdslam.perception.kept_findings import KeptFindings
 from birdslam.perception.manifest import Label, ModelError
 from birdslam.perception.manifest_file import shipped_manifests
 from birdslam.perception.network import ModelSpec, Network, load_network
@@ -17,6 +18,7 @@ __all__ = [
     "DepthMap",
     "Detections",
     "Findings",
+    "KeptFindings",
     "Label",
     "ModelError",
     "ModelSpec",

@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, wait
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -15,6 +16,7 @@ from birdslam.perception.decoding.depth import DepthMap
 from birdslam.perception.decoding.detection import Detections, with_bodies
 from birdslam.perception.decoding.multitask import Findings
 from birdslam.perception.decoding.segmentation import Segmentation
+from birdslam.perception.kept_findings import KeptFindings
 from birdslam.perception.manifest import Role, Schedule
 from birdslam.types import Frame, Status
 
@@ -153,9 +155,10 @@ class Networks:
     between two frames. A multi-task head yields each role that another head has; with `bodies` its 3-D boxes still
     complete the other detector's boxes of the same image (`decoding.detection.with_bodies`). `boxes_alone` runs such a
     head without its masks; one run in `masks_every` includes them. `submit(run, image) -> Future` belongs to an
-    executor with a thread per head. With `patience_s` None every running head is awaited, so the results depend only on
-    the frames. Otherwise `result()` waits at most that long for the `awaited` heads that started on its frame; all
-    other heads continue in the background and their last results are carried.
+    executor with a thread per head. A head does not run on an image whose findings are `kept`. With `patience_s` None
+    every running head is awaited, so the results depend only on the frames. Otherwise `result()` waits at most that
+    long for the `awaited` heads that started on its frame; all other heads continue in the background and their last
+    results are carried.
     """
 
     def __init__(
@@ -166,6 +169,7 @@ class Networks:
         bodies: bool = False,
         boxes_alone: Callable[[NDArray[np.uint8]], Findings | None] | None = None,
         detections: Mapping[int, Detections] | None = None,
+        kept: KeptFindings | None = None,
     ) -> None:
         for key in ("name", "role"):
             values = [getattr(head, key) for head in heads]
@@ -179,6 +183,7 @@ class Networks:
         self._bodies = bodies
         self._boxes_alone = boxes_alone
         self._detections = detections
+        self._kept = kept
         own = {head.role for head in heads}
         self._slots = [
             _Slot(
@@ -196,6 +201,7 @@ class Networks:
         image: NDArray[np.uint8] | None,
         only: Collection[Role] | None = None,
         detections: Detections | None = None,
+        t_source_ns: int = 0,
     ) -> Pending:
         """Starts the heads that are due, of the roles in `only` (None: all). `detections` are an external detector's.
 
@@ -219,7 +225,10 @@ class Networks:
             feeds = {*slot.fills, *(("detector",) if self._bodies and slot.head.role in ROLES else ())}
             wanted = bool(feeds) and (only is None or not feeds.isdisjoint(only))
             if image is not None and due and wanted and slot.running is None:
-                slot.running = self._submit(self._begin(slot, frame_id), image)
+                run = self._begin(slot, frame_id)
+                if self._kept is not None:
+                    run = partial(self._kept.run, slot.head.name, t_source_ns, run)
+                slot.running = self._submit(run, image)
                 started_any = True
         self.frames_with_start += started_any
         pending = _Started(self, frame_id)
@@ -239,7 +248,7 @@ class Networks:
         def start_next() -> None:
             frame = next(remaining, None) if not started else None
             if frame is not None:
-                started.append((frame, self.start(frame.frame_id, frame.image)))
+                started.append((frame, self.start(frame.frame_id, frame.image, t_source_ns=frame.t_source_ns)))
 
         start_next()
         while started:

@@ -18,6 +18,7 @@ from birdslam.calibration.travel import TravelPitch
 from birdslam.frontend import Pending
 from birdslam.geometry.camera import Camera
 from birdslam.outputs.plain_words import LengthsBy
+from birdslam.perception import KeptFindings
 from birdslam.ros.bag import BagTopics
 from birdslam.runtime.calibration.given import Given, frame_size, lens_of
 from birdslam.runtime.calibration.height import (
@@ -27,7 +28,6 @@ from birdslam.runtime.calibration.height import (
     lengths_by,
     with_height,
 )
-from birdslam.runtime.calibration.kept import KeptResults
 from birdslam.runtime.calibration.lens import corners_of_drive, lens_of_drive
 from birdslam.runtime.calibration.pieces import pieces, read_pieces
 from birdslam.runtime.calibration.report import report
@@ -44,11 +44,12 @@ TILT_HZ = 12.0  # least frame rate of the passes for the tilt: a higher one adds
 
 
 class Calibrated(NamedTuple):
-    """A camera with its report, and the source of its metric scale (`lengths_by`)."""
+    """A camera with its report, the source of its metric scale (`lengths_by`), and the networks' findings."""
 
     camera: Camera
     report: list[str]
     lengths_by: LengthsBy
+    kept: KeptFindings
 
 
 def calibrate_drive(
@@ -89,11 +90,11 @@ def calibrate_drive(
     cv2.setNumThreads(configuration.perceive.opencv_threads)
     configuration = configuration.as_lossless()
     config = msgspec.structs.replace(config, known_lane_m=given.size.lane_m, known_vehicle_m=given.size.car_height_m)
-    with Inference(configuration) as inference:
-        results = KeptResults(inference.networks)
+    kept = KeptFindings()
+    with Inference(configuration, kept=kept) as inference:
 
         def drive() -> Iterator[tuple[Frame, Pending]]:
-            return results.of_frames(read_pieces(recording, pieces(recording, most_frames), "calibrate"))
+            return inference.networks.in_order(read_pieces(recording, pieces(recording, most_frames), "calibrate"))
 
         try:
             found = calibrate(
@@ -112,6 +113,7 @@ def calibrate_drive(
         camera,
         [*report(found, camera, height_by, uri, lens, readout)],
         lengths_by(camera, height_by, lens, given.fov_deg),
+        kept,
     )
 
 

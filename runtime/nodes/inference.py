@@ -17,7 +17,7 @@ from typing import Any
 from birdslam.frontend import Pending
 from birdslam.geometry.camera import Camera
 from birdslam.lanes.amodal.lane_mapper import LaneHead
-from birdslam.perception import Detections, ModelSpec, Networks, Perception, Ready, load_network
+from birdslam.perception import Detections, KeptFindings, ModelSpec, Networks, Perception, Ready, load_network
 from birdslam.perception.completion import GridCompletion, shipped_completion
 from birdslam.perception.manifest import Role
 from birdslam.perception.pointnet import PointNet, load_pointnet
@@ -57,8 +57,10 @@ class Inference(Closing):
     so do the lanes. Raises perception.ModelError.
     """
 
-    def __init__(self, configuration: Configuration, boxes_only: bool = False) -> None:
-        """With `boxes_only` only the boxes of road users are computed, bit-identical."""
+    def __init__(
+        self, configuration: Configuration, boxes_only: bool = False, kept: KeptFindings | None = None
+    ) -> None:
+        """With `boxes_only` only the boxes of road users are computed, bit-identical; `kept` has earlier findings."""
         schedule, looks = configuration.perceive.schedule, configuration.perceive.looks
         specs = {role: schedule.of(role, spec) for role, spec in configuration.models.in_use().items()}
         self._adapts = looks.adaptive and not configuration.lossless
@@ -113,6 +115,7 @@ class Inference(Closing):
             bodies=configuration.models.bodies,
             boxes_alone=self._boxes_alone,
             detections=boxes,
+            kept=kept,
         )
         if boxes_only:
             self.networks.masks_every = sys.maxsize
@@ -222,7 +225,7 @@ class Inference(Closing):
             image = None
         elif mode is Mode.BOXES:
             only = ("detector",)
-        pending = self.networks.start(frame.frame_id, image, only)
+        pending = self.networks.start(frame.frame_id, image, only, t_source_ns=frame.t_source_ns)
         if image is not None:
             self._ran_frame = frame.frame_id
         if mode is Mode.BOXES:

@@ -18,6 +18,7 @@ import msgspec
 from birdslam.frontend import FrontEnd, Pending
 from birdslam.geometry.camera import Camera
 from birdslam.graph.minimum import solver
+from birdslam.perception import KeptFindings
 from birdslam.perception.schedule import Followed
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.nodes.capture import CaptureNode, stamps
@@ -27,7 +28,7 @@ from birdslam.runtime.nodes.inference import Inference
 from birdslam.runtime.nodes.optimize import OptimizeNode
 from birdslam.runtime.process.restarts import Assignment
 from birdslam.runtime.transport.bus import Bus, Message
-from birdslam.runtime.transport.presence import ring_path
+from birdslam.runtime.transport.presence import findings_path, ring_path
 from birdslam.runtime.transport.ring import FrameReader
 from birdslam.types import INVALIDATING, Attitude, Frame, FrameRef, Measurements, Status
 
@@ -225,7 +226,9 @@ def prepare(name: str, configuration: Configuration) -> Callable[[Bus, Callable[
     """Does the slow part of the start, which processes can do in parallel; the result builds the node at once."""
     if name == "perceive":
         cv2.setNumThreads(configuration.perceive.opencv_threads)
-        inference = Inference(configuration)
+        findings = configuration.runtime_dir and findings_path(configuration.runtime_dir)
+        kept = KeptFindings.read(findings) if findings and configuration.lossless and findings.exists() else None
+        inference = Inference(configuration, kept=kept)
         frontend = front_end(configuration, inference)
         return lambda bus, wait, assignment: PerceiveNode(configuration, inference, frontend, bus, assignment)
     if name == "optimize":

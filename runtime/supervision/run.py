@@ -23,7 +23,7 @@ from birdslam.loops.map_file import MapError
 from birdslam.outputs.drive_files import Recorder, ResultsError, claim_directory
 from birdslam.outputs.plain_words import LengthsBy
 from birdslam.outputs.report.page import REPORT
-from birdslam.perception import ModelError, load_network
+from birdslam.perception import KeptFindings, ModelError, load_network
 from birdslam.perception.pointnet import load_pointnet
 from birdslam.runtime.configuration import Configuration, ConfigurationError, complete
 from birdslam.runtime.environment import INTERRUPTED_STATUS
@@ -43,7 +43,13 @@ from birdslam.runtime.supervision.report import summarise, table
 from birdslam.runtime.supervision.supervisor import Supervisor
 from birdslam.runtime.topology import NODES
 from birdslam.runtime.transport.bus import Bus
-from birdslam.runtime.transport.presence import VehicleLock, own_runtime_dir, runtime_dir_of, socket_path
+from birdslam.runtime.transport.presence import (
+    VehicleLock,
+    findings_path,
+    own_runtime_dir,
+    runtime_dir_of,
+    socket_path,
+)
 from birdslam.sources.recording import DatasetError
 
 ANY_VEHICLE = Configuration().vehicle  # the default name
@@ -52,16 +58,23 @@ USER_ERRORS = MapError, GnssError, EarthError, ConfigurationError  # of a map or
 DRIVE_MIB = 32.0, 8.0  # reserved for objects (the atlas has up to two epochs of 13 MiB) and for tables
 
 
-def run(configuration: Configuration, lengths_by: LengthsBy | None = None, film_track: Path | None = None) -> int:
+def run(
+    configuration: Configuration,
+    lengths_by: LengthsBy | None = None,
+    film_track: Path | None = None,
+    kept: KeptFindings | None = None,
+) -> int:
     """Runs a drive; returns the exit status. Raises errors of the user before anything is started.
 
     `lengths_by`: the source of the metric scale, for the verdict at the end, if a first pass calibrated the camera.
-    `film_track`: GNSS fixes found inside the film. At
-    rate "max", without a vehicle name or a runtime directory, the run has a private bus.
+    `film_track`: GNSS fixes found inside the film. At rate "max", without a vehicle name or a runtime directory, the
+    run has a private bus, and its networks do not run where a first pass has `kept` their findings.
     """
     alone = configuration.lossless and configuration.vehicle == ANY_VEHICLE and configuration.runtime_dir is None
     with own_runtime_dir(configuration.vehicle) if alone else nullcontext() as directory:
         if directory is not None:
+            if kept is not None:
+                kept.write(findings_path(directory))
             runtime = msgspec.structs.replace(configuration.runtime, runtime_dir=str(directory))
             configuration = msgspec.structs.replace(configuration, runtime=runtime)
         return _run(configuration, lengths_by, film_track)

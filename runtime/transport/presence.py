@@ -100,6 +100,11 @@ def socket_path(directory: Path, name: str) -> Path:
     return path
 
 
+def findings_path(directory: Path) -> Path:
+    """Returns the path of the networks' findings of an earlier pass, in a private runtime directory."""
+    return directory / "findings.msgpack"
+
+
 def ring_path(vehicle: str, runtime_dir: Path | None = None) -> Path:
     """Returns the path of a vehicle's ring of frames: in shared memory, else in its runtime directory."""
     directory = runtime_dir_of(vehicle, runtime_dir)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 
 from birdslam.calibration.camera_files import format_of
 from birdslam.loops.gnss.files import GnssError
-from birdslam.outputs.plain_words import LengthsBy
 from birdslam.perception import ModelError
 from birdslam.runtime.cli.arguments import (
     add_detections,
@@ -32,6 +32,9 @@ from birdslam.runtime.schemes import all_schemes, is_live
 from birdslam.runtime.supervision.run import run as run_processes
 from birdslam.sources.films.container import films_in
 from birdslam.sources.schemes import VIDEO, scheme_of
+
+if TYPE_CHECKING:
+    from birdslam.runtime.calibration.drive import Calibrated
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -74,8 +77,8 @@ def run(options: argparse.Namespace) -> int:
     stated = (options.height, lens, options.known_length)
     if all(each is None for each in stated) and (scheme is not VIDEO or configuration.camera is not None):
         return run_processes(configuration, None, film_track)
-    configuration, lengths_by = _calibrated(configuration, options, lens)
-    return run_processes(configuration, lengths_by, film_track)
+    configuration, found = _calibrated(configuration, options, lens)
+    return run_processes(configuration, found.lengths_by, film_track, found.kept)
 
 
 def _lens_of_another_project(options: argparse.Namespace) -> Path | None:
@@ -150,8 +153,8 @@ def _networks(configuration: Configuration, fetch_them: bool) -> tuple[str, ...]
 
 def _calibrated(
     configuration: Configuration, options: argparse.Namespace, lens: Path | None
-) -> tuple[Configuration, LengthsBy]:
-    """Returns the configuration with the camera estimated by a first pass, and what its scale rests on.
+) -> tuple[Configuration, Calibrated]:
+    """Returns the configuration with the camera estimated by a first pass, and the results of that pass.
 
     `lens` is a calibration of another project. Writes the camera file beside the results.
     """
@@ -186,4 +189,4 @@ def _calibrated(
     print("\n".join((*found.report, f"camera file: {path}")), flush=True)
     if source.rate is None:  # a film has no real time
         source = msgspec.structs.replace(source, rate="max")
-    return msgspec.structs.replace(configuration, camera=found.camera, source=source), found.lengths_by
+    return msgspec.structs.replace(configuration, camera=found.camera, source=source), found
