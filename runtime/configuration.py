@@ -1,8 +1,8 @@
 """The typed configuration of the whole system, with its defaults.
 
-A TOML file may set the keys in `runtime/keys.py`; the other fields are constants, for programs and `--constant`. An
-unknown key, a constant or a wrong type raises a `ConfigurationError` with the file (or the option) and the key. Paths
-in a file are relative to that file.
+The keys in `runtime/keys.py` are for users; the other fields are constants, which experiments may set too. An unknown
+key or a wrong type raises a `ConfigurationError` with the file (or the option) and the key. Paths in a file are
+relative to that file.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from birdslam.geometry.camera import Camera
 from birdslam.lanes.amodal.atlas import AtlasConfig
 from birdslam.paper import PAPER
 from birdslam.perception import ModelError, ModelSpec
-from birdslam.runtime.fields import differences, fields, laid_over, leaves, why_no_key
+from birdslam.runtime.fields import differences, fields, laid_over
 from birdslam.runtime.models import store as model_store
 from birdslam.runtime.schemes import all_schemes, is_live
 from birdslam.runtime.sections import (
@@ -68,7 +68,6 @@ __all__ = [
     "dump",
     "load",
     "parse_setting",
-    "refuse_constant",
     "without_passwords",
 ]
 
@@ -158,12 +157,10 @@ def load(
     path: Path | None,
     overrides: Mapping[str, Any] | None = None,
     models: Iterable[str] = (),
-    constants: Mapping[str, Any] | None = None,
 ) -> Configuration:
     """Loads the configuration of a TOML file with `overrides` ({"source.stride": 2}).
 
-    Both may name only keys of `runtime/keys.py`. `models`: names of installed networks, each for the role of its
-    manifest; `constants` may name any field ({"slam.graph.ego_nodes": 8}). Raises ConfigurationError.
+    `models`: names of installed networks, each for the role of its manifest. Raises ConfigurationError.
     """
     tree: dict[str, Any] = {}
     if path is not None:
@@ -177,14 +174,9 @@ def load(
     overrides = overrides or {}
     for key, value in overrides.items():
         _put(tree, key, value)
-    for key in leaves(tree):
-        refuse_constant(key, _origin(key, path, overrides))
     if tree.get("method") == "paper":
         preset = differences(msgspec.to_builtins(PAPER), msgspec.to_builtins(SlamConfig()))
         tree["slam"] = laid_over(preset, tree.get("slam", {}))
-    for key, value in (constants or {}).items():
-        _put(tree, key, value)
-    overrides = {**overrides, **(constants or {})}
     _read_camera_file(tree)
     _put_models(tree, models)
     try:
@@ -210,13 +202,6 @@ def complete(configuration: Configuration, camera: Camera, rate_hz: float) -> Co
         deadline_ms = min(perceive.deadline_periods * 1e3 / hz, configuration.budgets.perceived_ms)
         perceive = msgspec.structs.replace(perceive, deadline_ms=deadline_ms)
     return msgspec.structs.replace(configuration, camera=camera, perceive=perceive)
-
-
-def refuse_constant(key: str, origin: str) -> None:
-    """Raises ConfigurationError if a file or `--set` names a constant."""
-    reason = why_no_key(key, Configuration)
-    if reason:
-        raise ConfigurationError(f"{origin}: {key}: {reason}")
 
 
 def parse_setting(text: str, option: str = "--set") -> tuple[str, Any]:

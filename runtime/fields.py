@@ -1,20 +1,17 @@
-"""The fields of the typed configuration by key, for the checks of a file's keys and `--constant`.
+"""The fields of the typed configuration by key.
 
 A table per name ("vehicles.car") has the key NAME.
 """
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 import msgspec
 from msgspec import inspect as kinds
-
-from birdslam.runtime.keys import KEYS
 
 ANY_NAME = "NAME"
 
@@ -33,11 +30,6 @@ class Field:
         """The name of the struct's field."""
         return self.key.rpartition(".")[2]
 
-    @property
-    def place(self) -> str:
-        """The place of its definition: "GraphConfig in birdslam/graph/graph_config.py"."""
-        return f"{self.struct.__name__} in {self.struct.__module__.replace('.', '/')}.py"
-
 
 class ByName(dict[str, Any]):
     """Defaults per name."""
@@ -50,7 +42,7 @@ def fields(struct: type[msgspec.Struct], default: Any = None, prefix: str = "") 
         key, value = f"{prefix}{field.name}", _default(default, field)
         nested = _struct_in(field.type)
         if nested is None:
-            yield Field(key, _stated_by(struct, field.name), field.type, value)
+            yield Field(key, struct, field.type, value)
         elif isinstance(field.type, kinds.DictType):
             inner.append((nested, ByName(value or {}), f"{key}.{ANY_NAME}."))
         else:
@@ -67,15 +59,6 @@ def _own(struct: type[msgspec.Struct]) -> tuple[kinds.Field, ...]:
     return info.fields
 
 
-def leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
-    """Yields the keys of nested tables: {"a": {"b": 1}} has a.b."""
-    for name, value in tree.items():
-        if isinstance(value, Mapping):
-            yield from leaves(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}"
-
-
 def laid_over(tree: dict[str, Any], changes: Any) -> Any:
     """Returns nested tables updated with `changes`."""
     if not isinstance(changes, dict):
@@ -89,37 +72,10 @@ def differences(tree: dict[str, Any], default: dict[str, Any]) -> dict[str, Any]
     return {k: differences(v, default[k]) if isinstance(v, dict) else v for k, v in changed.items()}
 
 
-def is_key(name: str) -> bool:
-    """Whether a file may set this field."""
-    return any(stands_for(pattern, name) for pattern in KEYS)
-
-
-def parted(settings: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Splits settings into keys and constants, as `load` takes them."""
-    keys = {name: value for name, value in settings.items() if is_key(name)}
-    return keys, {name: value for name, value in settings.items() if name not in keys}
-
-
-def why_no_key(name: str, configuration: type[msgspec.Struct]) -> str:
-    """Returns why a file may not set a constant, and how to set it; "" for a key and for an unknown field."""
-    field = None if is_key(name) else next((f for f in fields(configuration) if stands_for(f.key, name)), None)
-    if field is None:
-        return ""
-    return (
-        f"is a constant, not a key: field {field.name} of {field.place}. "
-        f'Set it by --constant {name}=VALUE, or from Python by load(..., constants={{"{name}": VALUE}})'
-    )
-
-
 def stands_for(pattern: str, key: str) -> bool:
     """Whether a key matches a pattern, whose words in capitals match any word: models.ROLE.path."""
     words, names = pattern.split("."), key.split(".")
     return len(words) == len(names) and all(w == n or w.isupper() for w, n in zip(words, names, strict=True))
-
-
-def _stated_by(struct: type[msgspec.Struct], name: str) -> type[msgspec.Struct]:
-    """Returns the struct or its base that defines the field."""
-    return next(base for base in struct.__mro__ if name in inspect.get_annotations(base))
 
 
 def _default(values: Any, field: kinds.Field) -> Any:

@@ -16,7 +16,7 @@ def configuration_of(options: argparse.Namespace) -> Configuration:
     """Loads the configuration file, overridden by the options of the command line. Raises ConfigurationError."""
     take_inputs(options)
     overrides, named = overrides_of(options)
-    return load(options.config, overrides, named, constants_of(options))
+    return load(options.config, overrides, named)
 
 
 def take_inputs(options: argparse.Namespace) -> None:
@@ -34,11 +34,6 @@ def take_inputs(options: argparse.Namespace) -> None:
             except ValueError as error:
                 raise ConfigurationError(str(error)) from None
     options.inputs = ()
-
-
-def constants_of(options: argparse.Namespace) -> dict[str, Any]:
-    """Returns the fields and values of `--constant`."""
-    return dict(parse_setting(text, "--constant") for text in options.constant)
 
 
 def overrides_of(options: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:

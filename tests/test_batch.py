@@ -46,7 +46,7 @@ def kitti(folder: Path, frames: int = 4, truth: bool = False) -> Path:
 
 
 def made(places: list[Path], settings: tuple[str, ...] = ()) -> list[Task]:
-    return tasks(find_drives([str(p) for p in places]), sweep(settings), None, PLAIN, [], {})
+    return tasks(find_drives([str(p) for p in places]), sweep(settings), None, PLAIN, [])
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -113,7 +113,7 @@ def test_paths_are_independent_of_the_working_directory(tmp_path: Path, monkeypa
     (tmp_path / "net.onnx").touch()
     monkeypatch.chdir(tmp_path)
     overrides = {"source.speed": "speed.txt", "models.detector.path": "net.onnx"}
-    (task,) = tasks(find_drives(["00"]), sweep([]), None, overrides, [], {})
+    (task,) = tasks(find_drives(["00"]), sweep([]), None, overrides, [])
     assert task.uri == f"kitti:{tmp_path / '00'}"
     assert task.configuration["source"]["speed"] == str(tmp_path / "speed.txt")
     assert task.configuration["models"]["detector"]["path"] == str(tmp_path / "net.onnx")
@@ -151,7 +151,7 @@ def test_results_are_atomic_and_deterministic(tmp_path: Path, monkeypatch: pytes
 
 def test_the_first_frames_of_a_drive_are_compared_with_the_truth(tmp_path: Path) -> None:
     drive = kitti(tmp_path / "sequences" / "00", frames=6, truth=True)
-    (task,) = tasks(find_drives([str(drive)]), sweep([]), None, {**PLAIN, "source.frames": 4}, [], {})
+    (task,) = tasks(find_drives([str(drive)]), sweep([]), None, {**PLAIN, "source.frames": 4}, [])
     told = []
     run_drive(Job(task, str(tmp_path / "out")), lambda *at: told.append(at))
     assert told[-1] == (4, 4)

@@ -15,7 +15,7 @@ from birdslam.graph.graph_config import GraphConfig
 from birdslam.paper import PAPER
 from birdslam.perception import ModelSpec
 from birdslam.runtime.configuration import Configuration, ConfigurationError, complete, dump, load, parse_setting
-from birdslam.runtime.fields import fields, is_key, parted, stands_for, why_no_key
+from birdslam.runtime.fields import fields, stands_for
 from birdslam.runtime.keys import GROUPS, KEYS
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -197,55 +197,13 @@ def test_every_key_is_a_field_and_has_a_meaning() -> None:
     assert len(KEYS) == sum(len(group.meanings) for group in GROUPS) <= 120
 
 
-@pytest.mark.parametrize(
-    ("text", "key", "place"),
-    [
-        ("[slam.graph]\nego_nodes = 8\n", "slam.graph.ego_nodes", "GraphConfig in birdslam/graph/graph_config.py"),
-        ("[perceive.looks]\nslight_load = 1.0\n", "perceive.looks.slight_load", "LooksConfig in birdslam/runtime/"),
-        ("[slam.weights]\nmode = 'paper'\n", "slam.weights.mode", "WeightsConfig in birdslam/graph/weights.py"),
-    ],
-)
-def test_a_constant_in_a_file_is_rejected_with_its_definition(tmp_path: Path, text: str, key: str, place: str) -> None:
-    path = write(tmp_path / "old.toml", text)
-    with pytest.raises(ConfigurationError) as error:
-        load(path)
-    message = str(error.value)
-    assert message.startswith(f"{path}: {key}: is a constant, not a key: field {key.split('.')[-1]} of ")
-    assert place in message
-    assert f"--constant {key}=VALUE" in message
-
-
-def test_every_field_is_a_key_or_a_constant() -> None:
-    for field in fields(Configuration):
-        name = field.key.replace("NAME", "car")
-        assert is_key(name) == (why_no_key(name, Configuration) == "")
-    assert not is_key("slam.nothing")
-    assert why_no_key("slam.nothing", Configuration) == ""
-
-
-def test_a_constant_overrides_all_other_settings() -> None:
-    made = load(None, {"slam.graph.forget_s": 2.0}, constants={"slam.graph.forget_s": 3.0, "slam.graph.ego_nodes": 6})
-    assert (made.slam.graph.forget_s, made.slam.graph.ego_nodes) == (3.0, 6)
-    with pytest.raises(ConfigurationError, match=r"^command line: slam\.graph\.ego_nodes: .*<= 64"):
-        load(None, constants={"slam.graph.ego_nodes": 65})
-    with pytest.raises(ConfigurationError, match="no such key"):
-        load(None, constants={"slam.graph.egos": 6})
-
-
-def test_settings_are_split_into_keys_and_constants() -> None:
-    assert parted({"source.stride": 2, "slam.graph.ego_nodes": 6}) == (
-        {"source.stride": 2},
-        {"slam.graph.ego_nodes": 6},
-    )
-
-
 def test_method_paper_selects_the_method_of_the_paper(tmp_path: Path) -> None:
     assert load(ROOT / "configs" / "paper.toml").slam == PAPER
     path = write(tmp_path / "a.toml", 'method = "paper"\n[slam.graph]\nforget_s = 2.0\n')
     graph = msgspec.structs.replace(PAPER.graph, forget_s=2.0)
     assert load(path).slam == msgspec.structs.replace(PAPER, graph=graph)
     assert load(path, {"method": "birdslam"}).slam.graph == GraphConfig(forget_s=2.0)
-    varied = load(path, constants={"slam.graph.forget_s": 1.0, "slam.graph.constant_velocity": True}).slam.graph
+    varied = load(path, {"slam.graph.forget_s": 1.0, "slam.graph.constant_velocity": True}).slam.graph
     assert varied == msgspec.structs.replace(PAPER.graph, constant_velocity=True)
     one_class = "[slam.frontend.localisation.vehicles.car]\nlength_m = 4.5\nwidth_m = 1.8\nheight_m = 1.5\n"
     for method in ("birdslam", "paper"):

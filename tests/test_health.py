@@ -530,7 +530,7 @@ from birdslam.runtime.process.child import give_back_memory
 def heap_kib():
     parts = Path("/proc/self/smaps").read_text().split("[heap]")[1:]
     return sum(int(part.split("Rss:")[1].split()[0]) for part in parts)
-configuration = load(None, {"source.uri": "demo", "source.rate": "max", "source.frames": 120}, [], {})
+configuration = load(None, {"source.uri": "demo", "source.rate": "max", "source.frames": 120})
 source = open_source(configuration)
 configuration = complete(configuration, source.camera, source.rate_hz)
 cv2.setNumThreads(configuration.perceive.opencv_threads)

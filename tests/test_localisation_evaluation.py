@@ -116,7 +116,7 @@ def test_constants_of_the_command_line_count_in_paper_mode_too(tmp_path: Path) -
     root = tracking_world.write(tmp_path / "root")
     rows = {}
     for reach in ("0.0", "1.0"):
-        asked = ["--set", "method=paper", "--constant", f"slam.frontend.localisation.reach_rel={reach}"]
+        asked = ["--set", "method=paper", "--set", f"slam.frontend.localisation.reach_rel={reach}"]
         assert main(["evaluate", "localisation", str(root), *asked, "--output", str(tmp_path / reach)]) == 0
         rows[reach] = json.loads((tmp_path / reach / "report.json").read_text())
     at_face, at_centre = ([row["depth_bias_median_rel"] for row in rows[reach] if row["n"]] for reach in ("0.0", "1.0"))

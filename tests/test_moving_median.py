@@ -129,10 +129,10 @@ def test_a_hidden_road_carries_the_scale_and_a_new_window_forgets_it() -> None:
 def test_key_selects_the_strategy_and_is_validated(tmp_path: Path) -> None:
     key = "slam.frontend.odometry.road.mode"
     assert isinstance(Odometry(CAMERA)._scale, RoadScale)  # private: else a drive for each
-    paper = load(None, constants={key: "paper"}).slam.frontend.odometry
+    paper = load(None, {key: "paper"}).slam.frontend.odometry
     assert isinstance(Odometry(CAMERA, paper)._scale, MovingMedianScale)  # private: likewise
     with pytest.raises(ConfigurationError, match=key):
-        load(None, constants={key: "median"})
+        load(None, {key: "median"})
     with pytest.raises(msgspec.ValidationError, match="median_frames"):
         msgspec.convert({"road": {"median_frames": 0}}, OdometryConfig)
     path = tmp_path / "paper.toml"

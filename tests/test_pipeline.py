@@ -481,7 +481,7 @@ def test_degraded_modes_are_reported_and_no_wrong_pose_is_valid(drive: Path, pla
         Run(
             *(place, "--source", f"kitti:{drive}", "--set", "source.loop=true", *WITH_NETWORKS),
             *(part for name in budgets for part in ("--set", f"budgets.{name}=0.001")),
-            *("--constant", "degradation.window_frames=2", "--constant", "degradation.coast_divisor=6"),
+            *("--set", "degradation.window_frames=2", "--set", "degradation.coast_divisor=6"),
             *("--set", "degradation.coast_max_ms=250", "--set", "budgets.end_to_end_ms=60000"),  # optimize has time
         ) as run,
         Planner(run.vehicle, run.runtime_dir) as planner,

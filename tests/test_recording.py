@@ -337,7 +337,7 @@ def test_kills_and_restarts_lose_no_data(tmp_path_factory: pytest.TempPathFactor
         Run(
             *(place, "--source", f"kitti:{drive}", "--rate", "25", "--set", "source.loop=true"),
             *("--record", str(file), "--record-images"),
-            *("--constant", "runtime.catch_up_ms=60000"),  # a busy perceive may take its time
+            *("--set", "runtime.catch_up_ms=60000"),  # a busy perceive may take its time
         ) as run,
         Planner(run.vehicle, run.runtime_dir) as planner,
     ):

@@ -31,7 +31,7 @@ from tests.taped_drive import CAMERA, Tape, measured
 
 
 def options(recording: Path, values: Sequence[str] = (), output: Path | None = None) -> argparse.Namespace:
-    settings = [word for value in values for word in ("--set" if value.startswith("method") else "--constant", value)]
+    settings = [word for value in values for word in ("--set", value)]
     return parse(["replay", str(recording), *settings, *(("--output", str(output)) if output else ())])
 
 

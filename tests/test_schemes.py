@@ -155,7 +155,7 @@ def test_evaluate_and_calibrate_and_batch_take_a_toy_source(toy: Path, capsys: p
     assert (toy.parent / "lanes" / "lanes_drive_3.png").is_file()
     assert main(["calibrate", f"toy:{toy}", "--output", str(toy.parent / "camera.toml"), *NO_NETWORK]) == 2
     assert f"toy:{toy}: too little motion" in capsys.readouterr().err
-    (task,) = tasks(find_drives([str(toy)]), sweep([]), None, {"models.shipped": False}, [], {})
+    (task,) = tasks(find_drives([str(toy)]), sweep([]), None, {"models.shipped": False}, [])
     assert task.uri == f"toy:{toy}"
     run_drive(Job(task, str(toy.parent / "batch")), lambda *at: None)
     assert (toy.parent / "batch" / DRIVES / "drive" / "summary.json").is_file()

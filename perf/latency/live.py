@@ -7,7 +7,7 @@ import json
 import subprocess
 import tempfile
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
@@ -18,7 +18,6 @@ import psutil
 from birdslam.perf.errors import PerfError
 from birdslam.perf.processes import birdslam_command, processes_of
 from birdslam.runtime.client import Planner
-from birdslam.runtime.fields import is_key
 from birdslam.runtime.topology import MAP, NODES
 from birdslam.runtime.transport.bus import Message
 from birdslam.types import Status
@@ -52,7 +51,7 @@ class Ask(msgspec.Struct, frozen=True, kw_only=True):
             *birdslam_command("run", *([self.config] if self.config else [])),
             *("--source", self.source, "--rate", str(self.rate), "--vehicle", _VEHICLE, "--output", str(place / "out")),
             *(part for model in self.models for part in ("--model", model)),
-            *setting_options(settings),
+            *(part for setting in settings for part in ("--set", setting)),
         ]
 
 
@@ -166,11 +165,6 @@ def _planners(count: int, runtime_dir: Path) -> Iterator[None]:
         for other in others:
             other.kill()
             other.wait()
-
-
-def setting_options(settings: Iterable[str]) -> list[str]:
-    """The options of `birdslam run` for KEY=VALUE of any field, a configuration key or a constant."""
-    return [part for text in settings for part in ("--set" if is_key(text.partition("=")[0]) else "--constant", text)]
 
 
 def add_run_options(add: Any) -> None:

@@ -16,7 +16,6 @@ import msgspec
 
 from birdslam.runtime.batch.fetch import is_url
 from birdslam.runtime.configuration import ConfigurationError, dump, load, parse_setting
-from birdslam.runtime.fields import parted
 from birdslam.runtime.schemes import MCAP, all_schemes
 from birdslam.sources.schemes import KITTI, ROSBAG, by_suffix, scheme_at, scheme_of
 
@@ -121,9 +120,9 @@ def sweep(texts: Sequence[str]) -> list[dict[str, Any]]:
 
 def tasks(
     drives: Sequence[Found], settings: Sequence[Mapping[str, Any]], config: Path | None, overrides: Mapping[str, Any],
-    models: Sequence[str], constants: Mapping[str, Any],
+    models: Sequence[str],
 ) -> list[Task]:  # fmt: skip
-    """Combines each drive with each of the settings; a setting may be a constant. Raises ConfigurationError.
+    """Combines each drive with each of the settings. Raises ConfigurationError.
 
     Drives of the same settings share one configuration, without the source's URI, to save memory.
     """
@@ -131,12 +130,11 @@ def tasks(
     known: dict[bytes, tuple[dict[str, Any], bytes]] = {}
     for drive, name in zip(drives, _names(drives), strict=True):
         for swept in settings:
-            swept_keys, swept_constants = parted(swept)
-            own = {**drive.settings, **swept_keys}
-            key = msgspec.json.encode((own, swept_constants), order="deterministic")
+            own = {**drive.settings, **swept}
+            key = msgspec.json.encode(own, order="deterministic")
             if key not in known:
                 given = {**overrides, **own, "source.uri": "", "source.rate": "max"}
-                configuration = load(config, given, models, {**constants, **swept_constants})
+                configuration = load(config, given, models)
                 if configuration.source.loop:
                     raise ConfigurationError("source.loop: a batch takes each drive once")
                 tree = dump(configuration)

@@ -100,10 +100,8 @@ def add_config(parser: argparse.ArgumentParser) -> None:
 
 
 def add_settings(parser: argparse.ArgumentParser, text: str = "set a key of docs/configuration.md") -> None:
-    """Adds single keys of the configuration, and constants for developers."""
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help=text)
-    text = "for developers: set any field of the typed configuration, e.g. slam.graph.ego_nodes=8"
-    parser.add_argument("--constant", action="append", default=[], metavar="KEY=VALUE", help=text)
+    """Adds single fields of the configuration."""
+    parser.add_argument("--set", "--constant", action="append", default=[], metavar="KEY=VALUE", help=text)
 
 
 def add_tracking_root(parser: argparse.ArgumentParser) -> None:

@@ -25,9 +25,8 @@ perceive.deadline_ms=25`. In a file the part of a key before its last point is t
 `deadline_ms = 25`. A word in capitals stands for any name: `models.detector.path`. An unknown key or a wrong type is
 an error. Paths in a file are relative to the file.
 
-There are {count} keys. All other numbers are constants of the code: a file that sets one is rejected with the place of
-the constant. Python programs can change them (`birdslam.slam.SlamConfig`), and experiments with `--constant KEY=VALUE`.
-[constants.md](constants.md) lists those that were tuned on data.
+There are {count} keys. All other fields of the typed configuration are constants of the code: experiments can set them
+in the same way, but they may change with any version. [constants.md](constants.md) lists those that were tuned on data.
 
 Units follow the endings of the keys: m, s, rad, px; a *fraction* is 1 for the whole. *Required* applies only if the
 table is present.

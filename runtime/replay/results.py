@@ -13,7 +13,7 @@ from birdslam.graph.g2o import g2o_lines
 from birdslam.outputs.drive_files import Recorder, claim_directory
 from birdslam.outputs.drive_video import DriveVideo, check_video
 from birdslam.outputs.final_trajectories import FinalTracks, last_seen, write_final_ego
-from birdslam.runtime.configuration import ConfigurationError, load, refuse_constant
+from birdslam.runtime.configuration import ConfigurationError, load
 from birdslam.runtime.recording.recorded_drive import measurements_of
 from birdslam.runtime.recording.recording import Recording, RecordingError
 from birdslam.runtime.replay.replay import BackEnd, estimates
@@ -66,15 +66,13 @@ def write_results(recording: Recording, config: BackEnd, output: Path, smooth: b
             video.finish()
 
 
-def changed_back_end(config: BackEnd, settings: Mapping[str, Any], constants: Mapping[str, Any]) -> BackEnd:
-    """Returns the back end with changed settings and constants. Raises ConfigurationError for unknown keys."""
-    for key in settings:
-        refuse_constant(key, "command line")
+def changed_back_end(config: BackEnd, settings: Mapping[str, Any]) -> BackEnd:
+    """Returns the back end with changed settings. Raises ConfigurationError for unknown keys."""
     if "method" in settings:
         slam = load(None, {"method": settings["method"]}).slam
         config = slam.graph, slam.weights
     parts = {"slam.graph": config[0], "slam.weights": config[1]}
-    for key, value in {**settings, **constants}.items():
+    for key, value in settings.items():
         name, _, field = key.rpartition(".")
         if key == "method":
             continue

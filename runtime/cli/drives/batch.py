@@ -11,7 +11,7 @@ from birdslam.runtime.batch.drives import find_drives, sweep, tasks
 from birdslam.runtime.cli.arguments import add_config, add_pipeline, add_topics
 from birdslam.runtime.configuration import ConfigurationError
 from birdslam.runtime.environment import INTERRUPTED_STATUS
-from birdslam.runtime.options import constants_of, overrides_of
+from birdslam.runtime.options import overrides_of
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,8 +39,7 @@ def run(options: argparse.Namespace) -> int:
     overrides.pop("output", None)
     if options.jobs is not None and options.jobs < 1:
         raise ConfigurationError(f"--jobs {options.jobs}: expected 1 or more")
-    constants = constants_of(options)
-    todo = tasks(find_drives(options.drives), sweep(options.sweep), options.config, overrides, models, constants)
+    todo = tasks(find_drives(options.drives), sweep(options.sweep), options.config, overrides, models)
     if before := sum(done(output, task) for task in todo):
         print(f"{before} of {len(todo)} drives are done already")
     address, map_file = options.address if options.engine == "ray" else None, Path(options.map) if options.map else None

@@ -7,7 +7,6 @@ from pathlib import Path
 
 from birdslam.runtime.cli.arguments import RECORDING, add_final_results, add_settings
 from birdslam.runtime.configuration import parse_setting
-from birdslam.runtime.options import constants_of
 from birdslam.runtime.progress import file_progress
 from birdslam.runtime.recording.recording import Recording
 from birdslam.runtime.replay.replay import back_end, compare
@@ -29,9 +28,9 @@ def run(options: argparse.Namespace) -> int:
     """Returns 0 if the back end reproduces the recorded estimates, 1 if not; or writes new results."""
     with file_progress("replay", options.recording) as progress:
         recording = Recording(options.recording, progress.reach)
-        if options.g2o or options.set or options.constant or options.output or options.smooth or options.video:
+        if options.g2o or options.set or options.output or options.smooth or options.video:
             settings = dict(parse_setting(text) for text in options.set)
-            config = changed_back_end(back_end(recording), settings, constants_of(options))
+            config = changed_back_end(back_end(recording), settings)
             if options.g2o:
                 write_g2o(recording, config, options.g2o)
                 text, status = f"graph in {options.g2o}", 0
