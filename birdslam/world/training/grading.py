@@ -17,7 +17,6 @@ from birdslam.world.truth import CLASSES, WorldFrame, WorldObject
 _ROAD, _LANE = (CLASSES.index(name) for name in ("road", "lane"))
 _VEHICLES = ("car", "van", "truck", "bus")
 MIN_VISIBLE_RATIO = 0.9  # of a body with a complete outline
-MIN_SIDE_ASPECT = 2.0  # width over height of the box of a vehicle seen from the side
 
 
 class GradingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -53,7 +52,6 @@ class Grades:
     size_rel: list[Floats] = field(default_factory=list)
     depth_z: list[float] = field(default_factory=list)  # error over stated sigma
     edge_rel: list[float] = field(default_factory=list)  # error of each edge of an unoccluded box, over its side
-    extents: list[Floats] = field(default_factory=list)  # of such boxes, see `extents`
 
     def add(self, findings: Findings, frame: WorldFrame) -> None:
         """Adds one frame; the findings refer to its image."""
@@ -97,8 +95,6 @@ class Grades:
                 if vehicles[best].visible > MIN_VISIBLE_RATIO and vehicles[best].truncated == 0.0:
                     sides = np.tile(truth[best, 2:] - truth[best, :2], 2)
                     self.edge_rel += (np.abs(found.boxes_px[row] - truth[best]) / sides).tolist()
-                    if found.scores[row] >= config.score:
-                        self.extents.append(extents(found.boxes_px[row], truth[best]))
                 if found.scores[row] >= config.score:
                     self._body(found, int(row), vehicles[best], frame)
             elif tall[row] and not box_ious(found.boxes_px[row : row + 1], people).max(initial=0.0) >= config.iou:
@@ -132,7 +128,6 @@ class Grades:
     def figures(self) -> dict[str, float]:
         """The rates; NaN without samples."""
         sizes = np.array(self.size_rel).reshape(-1, 3)
-        widths, heights, aspects = np.array(self.extents).reshape(-1, 3).T
         return {
             "frames": self.frames,
             "depth_absrel": _mean(self.absrel),
@@ -148,9 +143,6 @@ class Grades:
             "width_median_rel": _median(sizes[:, 1].tolist()),
             "height_median_rel": _median(sizes[:, 2].tolist()),
             "box_sigma_rel": 1.4826 * _median(self.edge_rel),  # box_sigma of a manifest, including the part in pixels
-            "box_width_ratio": _median(widths.tolist()),  # estimated over true: below 1 is too small
-            "box_height_ratio": _median(heights.tolist()),
-            "long_box_width_ratio": _median(widths[aspects >= MIN_SIDE_ASPECT].tolist()),
             "depth_sigma_ratio": 1.4826 * _median([abs(z) for z in self.depth_z]),
         }
 
@@ -158,13 +150,6 @@ class Grades:
 def _boxes_of(bodies: Sequence[WorldObject]) -> Floats:
     """Boxes (N, 4) in coordinates of pixel edges, as in detections."""
     return np.array([body.box_px for body in bodies], dtype=np.float64).reshape(-1, 4) + 0.5
-
-
-def extents(said: Floats, true: Floats) -> Floats:
-    """(3,) of two boxes: ratio of widths, ratio of heights, and the aspect ratio of the true box."""
-    said_px, true_px = said[2:] - said[:2], true[2:] - true[:2]
-    out: Floats = np.append(said_px / true_px, true_px[0] / true_px[1])
-    return out
 
 
 def overlap(guess: Bools, truth: Bools) -> Ints:
