@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from birdslam.bench.tracking.localisation import (
+    CAR_RANGES_M,
     INSIDE_1_SIGMA,
     INSIDE_2_SIGMA,
-    CarError,
-    LocalisationRow,
+    PlaceError,
+    PlacesRow,
     match_cars,
     measure,
     summarise_ranges,
@@ -54,9 +55,9 @@ def world(frames: int) -> tuple[TrackingSequence, list[Detections]]:
     return sequence, [Detections(box, np.full(3, 0.9), ("car",) * 3) for box in boxes]
 
 
-def depth_error(errors: list[CarError], span: str) -> float:
+def depth_error(errors: list[PlaceError], span: str) -> float:
     """The median of a range over all sequences."""
-    (row,) = [row for row in summarise_ranges(errors) if row.sequence == "all" and row.range == span]
+    (row,) = [row for row in summarise_ranges(errors, CAR_RANGES_M) if row.sequence == "all" and row.range == span]
     assert row.depth_error_median_rel is not None
     return row.depth_error_median_rel
 
@@ -80,14 +81,14 @@ def test_untruncated_cars_are_compared_and_a_tilted_road_is_found_out() -> None:
 def test_rows_are_medians_by_range_and_shares_inside_the_right_ellipses() -> None:
     rng = np.random.default_rng(0)
     z = rng.standard_normal((20000, 2))
-    errors = [CarError("a", k, 0, 20.0, e, float(e @ e)) for k, e in enumerate(z)]
-    errors.append(CarError("b", 0, 0, 45.0, np.array([-4.5, 0.2]), 9.0))
-    errors.append(CarError("b", 0, 1, 45.0, np.array([40.0, 40.0]), 900.0, cut=True))
-    rows = {(row.sequence, row.range): row for row in summarise_ranges(errors)}
+    errors = [PlaceError("a", k, 0, 20.0, e, float(e @ e)) for k, e in enumerate(z)]
+    errors.append(PlaceError("b", 0, 0, 45.0, np.array([-4.5, 0.2]), 9.0))
+    errors.append(PlaceError("b", 0, 1, 45.0, np.array([40.0, 40.0]), 900.0, cut=True))
+    rows = {(row.sequence, row.range): row for row in summarise_ranges(errors, CAR_RANGES_M)}
     assert list(rows) == [(s, r) for s in ("a", "b", "all") for r in ("0-15", "15-30", "30-50")]
-    assert rows["a", "0-15"] == LocalisationRow(sequence="a", range="0-15", n=0)
+    assert rows["a", "0-15"] == PlacesRow(sequence="a", range="0-15", n=0)
     gauss = rows["a", "15-30"]
-    assert gauss.cars == 1
+    assert gauss.tracks == 1
     assert gauss.inside_1_sigma == pytest.approx(0.683, abs=0.01)
     assert gauss.inside_2_sigma == pytest.approx(0.954, abs=0.01)
     far = rows["all", "30-50"]

@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from birdslam.bench.tracking.by_class.class_tracks import TracksRow
-from birdslam.bench.tracking.by_class.people import PeopleRow, boxes_of_hulls, has_labels, judge, summarise_people
+from birdslam.bench.tracking.by_class.people import boxes_of_hulls, has_labels, judge, summarise_people
 from birdslam.bench.tracking.localisation import (
     BOXES,
     CAMERA_OF_BOXES,
-    CarError,
-    LocalisationRow,
+    CAR_RANGES_M,
+    PlaceError,
+    PlacesRow,
     match_cars,
     measure,
     summarise_ranges,
@@ -27,13 +28,13 @@ from birdslam.sources.recording import DatasetError
 
 def evaluate_localisation(
     root: Path, names: Sequence[str], config: SlamConfig, draws: int = 1
-) -> tuple[list[LocalisationRow], StationaryRow | None]:
+) -> tuple[list[PlacesRow], StationaryRow | None]:
     """Returns position errors of cars by range, and the drift of stationary vehicles in the pose graph.
 
     The tilt error is drawn `draws` times, evaluated together. Raises DatasetError.
     """
     sequences = [open_tracking(root, name, CAMERA_OF_BOXES) for name in names]
-    errors: list[CarError] = []
+    errors: list[PlaceError] = []
     stationary = []
     with Progress("localisation", draws * sum(map(len, sequences))) as progress:
         progress.reach(0)
@@ -44,12 +45,12 @@ def evaluate_localisation(
                 errors += match_cars(sequence, measurements)
                 stationary += stationary_tracks(sequence, measurements, config)
                 progress.advance(len(sequence))
-    return summarise_ranges(errors), summarise_stationary(stationary)
+    return summarise_ranges(errors, CAR_RANGES_M), summarise_stationary(stationary)
 
 
 def evaluate_people(
     root: Path, names: Sequence[str], config: FrontEndConfig, kind: str
-) -> tuple[list[PeopleRow], list[TracksRow]]:
+) -> tuple[list[PlacesRow], list[TracksRow]]:
     """Returns position errors of pedestrians or cyclists by range, and their tracks in bird's-eye view.
 
     Skips sequences without labels of the class. RRC has no cyclists: their boxes are projected labels with the noise

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from birdslam.bench.figures import median
 from birdslam.bench.simulation.odometry import EXACT, OdometryNoise, SimulatedOdometry
 from birdslam.bench.simulation.tilt_from_images import TiltFromImages
 from birdslam.bench.tracking.benchmark import make_log
@@ -30,15 +31,19 @@ from birdslam.types import Measurements, VehicleEdge
 
 CAMERA_OF_BOXES = 2  # labels and RRC detections were drawn in its images
 BOXES = "det_02_rrc"  # the folder of the recorded boxes
-RANGES_M = ((0.0, 15.0), (15.0, 30.0), (30.0, 50.0))
+CAR_RANGES_M = ((0.0, 15.0), (15.0, 30.0), (30.0, 50.0))
 INSIDE_1_SIGMA, INSIDE_2_SIGMA = (float(chi2.ppf(chi2.cdf(k**2, 1), 2)) for k in (1, 2))  # 2.30, 6.18
 MEASURED_KIND = "Car"
-MAX_SQUARED_DISTANCE = 25.0  # squared Mahalanobis distance of a car, at the most: five sigma
+MAX_SQUARED_DISTANCE = 25.0  # squared Mahalanobis distance, at the most: five sigma
+WALKING_MPS = 0.5  # true speed of walking people
 
 
 @dataclass(frozen=True)
-class CarError:
-    """One car in one frame: its true depth, the error of its centre in ego (2,), that error's square over its cov."""
+class PlaceError:
+    """One road user in one frame: true depth, error of its centre in ego (2,), the square of that error over its cov.
+
+    `velocities_mps` of people are the true and the estimated one (2,) in ego; `cut`: by the image's edge.
+    """
 
     sequence: str
     frame: int
@@ -46,10 +51,11 @@ class CarError:
     depth_m: float
     error_m: Floats
     mahalanobis2: float
-    cut: bool = False  # by the image's edge
+    cut: bool = False
+    velocities_mps: tuple[Floats, Floats] | None = None
 
 
-class LocalisationRow(msgspec.Struct, frozen=True, kw_only=True):
+class PlacesRow(msgspec.Struct, frozen=True, kw_only=True):
     """A row of report.json; medians are None where `n` is 0. `depth_bias_median_rel` > 0 is too far."""
 
     sequence: str
@@ -60,8 +66,9 @@ class LocalisationRow(msgspec.Struct, frozen=True, kw_only=True):
     inside_1_sigma: float | None = None
     inside_2_sigma: float | None = None
     depth_bias_median_rel: float | None = None
-    cars: int = 0  # labelled tracks
-    nees: float | None = None  # mean squared Mahalanobis distance over its expectation; a car counts 25 at most
+    tracks: int = msgspec.field(default=0, name="cars")  # labelled; `cars` in report.json for any class
+    nees: float | None = None  # mean squared Mahalanobis distance over its expectation; 25 counts at most
+    walking_speed_error_median_mps: float | None = None  # of both components of the velocity of moving people
 
 
 def measure(
@@ -87,9 +94,9 @@ def measure(
     return make_log(sequence, range(len(sequence)), odometry, perceive, None, config)
 
 
-def match_cars(sequence: TrackingSequence, measurements: Iterable[Measurements]) -> list[CarError]:
+def match_cars(sequence: TrackingSequence, measurements: Iterable[Measurements]) -> list[PlaceError]:
     """Every matched car of the labels in every frame."""
-    errors: list[CarError] = []
+    errors: list[PlaceError] = []
     for record in measurements:
         here, edges = sequence.labels_of(record.frame_id), {edge.vehicle: edge for edge in record.cv}
         pairs = match_vehicles(here, list(edges), np.array([e.box_px for e in edges.values()]).reshape(-1, 4))
@@ -101,12 +108,12 @@ def match_cars(sequence: TrackingSequence, measurements: Iterable[Measurements])
     return errors
 
 
-def _error(sequence: TrackingSequence, label: Label, edge: VehicleEdge) -> CarError:
+def _error(sequence: TrackingSequence, label: Label, edge: VehicleEdge) -> PlaceError:
     truth = sequence.vehicle_truth(label, label.frame)  # world is the ego of that very frame
     error = np.array([edge.T_ego_vehicle.x_m - truth.x_m, edge.T_ego_vehicle.y_m - truth.y_m])
     R_ego_vehicle = edge.T_ego_vehicle.rotation()  # an edge's covariance is of the tangent at the vehicle's pose
     cov = R_ego_vehicle @ np.reshape(edge.cov, (3, 3))[:2, :2] @ R_ego_vehicle.T
-    return CarError(
+    return PlaceError(
         sequence=sequence.name,
         frame=label.frame,
         label=label.track,
@@ -117,25 +124,26 @@ def _error(sequence: TrackingSequence, label: Label, edge: VehicleEdge) -> CarEr
     )
 
 
-def summarise_ranges(errors: Sequence[CarError]) -> list[LocalisationRow]:
-    """Returns a row for each sequence and range, then those of "all" sequences, of cars that the image does not cut."""
+def summarise_ranges(errors: Sequence[PlaceError], ranges_m: Sequence[tuple[float, float]]) -> list[PlacesRow]:
+    """Returns a row for each sequence and range, then those of "all", of bodies that the image does not cut."""
     whole = [e for e in errors if not e.cut]
     names = list(dict.fromkeys(error.sequence for error in errors))
     groups = [(name, [e for e in whole if e.sequence == name]) for name in names] + [("all", whole)]
     return [
         _row(name, f"{near:.0f}-{far:.0f}", [e for e in group if near <= e.depth_m < far])
         for name, group in groups
-        for near, far in RANGES_M
+        for near, far in ranges_m
     ]
 
 
-def _row(sequence: str, span: str, errors: Sequence[CarError]) -> LocalisationRow:
+def _row(sequence: str, span: str, errors: Sequence[PlaceError]) -> PlacesRow:
     if not errors:
-        return LocalisationRow(sequence=sequence, range=span, n=0)
+        return PlacesRow(sequence=sequence, range=span, n=0)
     depth_m = np.array([e.depth_m for e in errors])
     along, across = np.array([e.error_m for e in errors]).T
     spread = np.array([e.mahalanobis2 for e in errors])
-    return LocalisationRow(
+    both = [e.velocities_mps for e in errors if e.velocities_mps is not None]
+    return PlacesRow(
         sequence=sequence,
         range=span,
         n=len(errors),
@@ -144,6 +152,9 @@ def _row(sequence: str, span: str, errors: Sequence[CarError]) -> LocalisationRo
         inside_1_sigma=float(np.mean(spread <= INSIDE_1_SIGMA)),
         inside_2_sigma=float(np.mean(spread <= INSIDE_2_SIGMA)),
         depth_bias_median_rel=float(np.median(along / depth_m)),
-        cars=len({(e.sequence, e.label) for e in errors}),
+        tracks=len({(e.sequence, e.label) for e in errors}),
         nees=float(np.mean(np.minimum(spread, MAX_SQUARED_DISTANCE))) / 2.0,
+        walking_speed_error_median_mps=median(
+            float(np.linalg.norm(estimated - true)) for true, estimated in both if np.linalg.norm(true) > WALKING_MPS
+        ),
     )

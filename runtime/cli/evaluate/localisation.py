@@ -7,8 +7,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from birdslam.bench.tracking.by_class.class_tracks import TracksRow
-from birdslam.bench.tracking.by_class.people import PEOPLE, PeopleRow
-from birdslam.bench.tracking.localisation import LocalisationRow
+from birdslam.bench.tracking.by_class.people import PEOPLE
+from birdslam.bench.tracking.localisation import PlacesRow
 from birdslam.bench.tracking.stationary import StationaryRow
 from birdslam.outputs.drive_files import claim_directory, write_json
 from birdslam.runtime.cli.arguments import add_config, add_settings, add_tracking_root
@@ -63,18 +63,18 @@ def _in_columns(cells: Iterable[tuple[float | None, str]]) -> str:
 _PLACES = f"{'depth':>9}{'bias':>9}{'across m':>10}{'1 sigma':>9}{'2 sigma':>9}"
 
 
-def _places(row: PeopleRow | LocalisationRow) -> str:
+def _places(row: PlacesRow) -> str:
     """Returns the columns of _PLACES."""
     rels = (row.depth_error_median_rel, "9.1%"), (row.depth_bias_median_rel, "+9.1%")
     shares = (row.inside_1_sigma, "9.0%"), (row.inside_2_sigma, "9.0%")
     return _in_columns((*rels, (row.lateral_error_median_m, "10.2f"), *shares))
 
 
-def _table(rows: Sequence[LocalisationRow]) -> str:
+def _table(rows: Sequence[PlacesRow]) -> str:
     lines = [f"{'':12}{'range m':>9}{'cars':>6}{'n':>7}{_PLACES}{'NEES':>7}"]
     for row in rows:
         places = f"{_places(row)}{_in_columns([(row.nees, '7.2f')])}"
-        lines.append(f"{row.sequence:12}{row.range:>9}{row.cars:>6}{row.n:>7}{places}")
+        lines.append(f"{row.sequence:12}{row.range:>9}{row.tracks:>6}{row.n:>7}{places}")
     return "\n".join(lines)
 
 
@@ -88,7 +88,7 @@ def _line_of_stationary(row: StationaryRow | None) -> str:
     )
 
 
-def _table_of_people(rows: Sequence[PeopleRow]) -> str:
+def _table_of_people(rows: Sequence[PlacesRow]) -> str:
     lines = [f"{'sequence':11}{'range m':>9}{'n':>7}{_PLACES}{'walking':>9}  (velocity error of walking people, m/s)"]
     for row in rows:
         speed = _in_columns([(row.walking_speed_error_median_mps, "9.2f")])

@@ -11,12 +11,10 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
-import msgspec
 import numpy as np
 
-from birdslam.bench.figures import median
 from birdslam.bench.tracking.by_class.class_tracks import KINDS, TracksRow, class_tracks, tracks_row
-from birdslam.bench.tracking.localisation import INSIDE_1_SIGMA, INSIDE_2_SIGMA
+from birdslam.bench.tracking.localisation import PlaceError, PlacesRow, summarise_ranges
 from birdslam.bench.tracking.metrics import BoxFrame, assign
 from birdslam.geometry.arrays import Floats
 from birdslam.perception import Detections
@@ -27,23 +25,10 @@ from birdslam.types import FollowedPerson, Measurements
 
 PEOPLE = ("pedestrian", "cyclist")
 RANGES_M = ((5.0, 15.0), (15.0, 30.0), (30.0, 50.0))
-WALKING_MPS = 0.5  # true speed of walking people
 TRUTH_S = 0.5  # a label's speed is its places' of so long before and after
 MATCH_IOU = 0.4  # of a box with the label's, in the image
 HULL_SIGMA = (0.035, 0.035, 0.035, 0.03)  # of RRC's boxes of people, left, upper, right, lower, of the height
 HULL_MEMORY = 0.7  # of a box's error, from frame to frame at 10 Hz
-
-
-@dataclass(frozen=True)
-class PersonError:
-    """One person in one frame: true depth, error in ego (2,), its square over its covariance; both speeds."""
-
-    sequence: str
-    depth_m: float
-    error_m: Floats
-    mahalanobis2: float
-    true_mps: Floats  # (2,) in ego
-    estimated_mps: Floats
 
 
 @dataclass
@@ -53,21 +38,7 @@ class PeopleResult:
     name: str
     kind: str
     tracked: list[BoxFrame]
-    errors: list[PersonError] = field(default_factory=list)
-
-
-class PeopleRow(msgspec.Struct, frozen=True, kw_only=True):
-    """A row of report.json: places and speeds in one range; None where nobody was there."""
-
-    sequence: str
-    range: str
-    n: int
-    depth_error_median_rel: float | None = None
-    depth_bias_median_rel: float | None = None
-    lateral_error_median_m: float | None = None
-    inside_1_sigma: float | None = None
-    inside_2_sigma: float | None = None
-    walking_speed_error_median_mps: float | None = None  # of the velocity's both components together
+    errors: list[PlaceError] = field(default_factory=list)
 
 
 def has_labels(sequence: TrackingSequence, kind: str) -> bool:
@@ -154,51 +125,24 @@ def _true_velocity(places: dict[int, Floats], frame: int) -> Floats:
 
 def _error(
     sequence: TrackingSequence, label: Label, person: FollowedPerson, places: dict[int, dict[int, Floats]]
-) -> PersonError:
+) -> PlaceError:
     truth = sequence.vehicle_truth(label, label.frame)
     error = np.array([person.x_m - truth.x_m, person.y_m - truth.y_m])
     R = sequence.ego_truth(0)[label.frame].rotation()
-    return PersonError(
+    return PlaceError(
         sequence=sequence.name,
+        frame=label.frame,
+        label=label.track,
         depth_m=truth.x_m,
         error_m=error,
         mahalanobis2=float(error @ np.linalg.solve(np.reshape(person.cov, (2, 2)), error)),
-        true_mps=_true_velocity(places[label.track], label.frame) @ R,
-        estimated_mps=np.array([person.vx_mps, person.vy_mps]),
+        velocities_mps=(_true_velocity(places[label.track], label.frame) @ R, np.array([person.vx_mps, person.vy_mps])),
     )
 
 
-def summarise_people(results: Sequence[PeopleResult]) -> tuple[list[PeopleRow], list[TracksRow]]:
+def summarise_people(results: Sequence[PeopleResult]) -> tuple[list[PlacesRow], list[TracksRow]]:
     """Returns rows of positions by range and of tracks, for each sequence and for all."""
-    groups = [(r.name, [r]) for r in results]
-    if len(results) > 1:
-        groups.append(("all", list(results)))
-    groups = [(name, group) for name, group in groups if any(r.errors for r in group)]
-    rows = [
-        _row(name, f"{near:.0f}-{far:.0f}", [e for r in group for e in r.errors if near <= e.depth_m < far])
-        for name, group in groups
-        for near, far in RANGES_M
-    ]
-    return rows, [tracks_row(name, group[0].kind, [r.tracked for r in group]) for name, group in groups]
-
-
-def _row(sequence: str, span: str, errors: Sequence[PersonError]) -> PeopleRow:
-    if not errors:
-        return PeopleRow(sequence=sequence, range=span, n=0)
-    depth_m = np.array([e.depth_m for e in errors])
-    along, across = np.array([e.error_m for e in errors]).T
-    spread = np.array([e.mahalanobis2 for e in errors])
-    true = np.array([e.true_mps for e in errors])
-    estimated = np.array([e.estimated_mps for e in errors])
-    walking = np.linalg.norm(true, axis=1) > WALKING_MPS
-    return PeopleRow(
-        sequence=sequence,
-        range=span,
-        n=len(errors),
-        depth_error_median_rel=float(np.median(np.abs(along) / depth_m)),
-        depth_bias_median_rel=float(np.median(along / depth_m)),
-        lateral_error_median_m=float(np.median(np.abs(across))),
-        inside_1_sigma=float(np.mean(spread <= INSIDE_1_SIGMA)),
-        inside_2_sigma=float(np.mean(spread <= INSIDE_2_SIGMA)),
-        walking_speed_error_median_mps=median(np.linalg.norm(estimated - true, axis=1)[walking]),
-    )
+    results = [result for result in results if result.errors]
+    rows = summarise_ranges([error for result in results for error in result.errors], RANGES_M)
+    groups = [(result.name, [result]) for result in results] + [("all", results)]
+    return rows, [tracks_row(name, group[0].kind, [r.tracked for r in group]) for name, group in groups if group]
