@@ -43,16 +43,15 @@ from birdslam.sources.recording import DatasetError
 from birdslam.sources.shipped_drive import TrueBody
 from birdslam.types import (
     Bound,
-    Estimate,
     FollowedPerson,
     LaneChange,
     LaneLine,
     Lanes,
     LineColour,
     LineKind,
-    VehicleEstimate,
     VehicleLane,
 )
+from tests.records import new_estimate, new_vehicle
 
 CAMERA = Camera(640, 240, 420.0, 420.0, 319.5, 90.0, height_m=1.5)
 NOBODY = np.zeros((0, 4))
@@ -767,22 +766,8 @@ def test_vehicle_extent_follows_its_heading() -> None:
     lanes = with_users(
         lanes, [UserInEgo(7, SE2(54.5, -0.2, 0.0), np.diag([16.0, 0.02, 0.01]), 4.0, 14.0)], 14.0, Traffic()
     )
-    vehicle = VehicleEstimate(
-        vehicle=7, T_world_vehicle=SE2(54.5, -0.2, 0.0), cov=(*np.eye(3).ravel().tolist(),), velocity_mps=(14.0, 0.0),
-        velocity_cov=(1.0, 0.0, 0.0, 1.0), age_ns=0, frames=9,
-    )  # fmt: skip
-    estimate = Estimate(
-        epoch=0,
-        frame_id=0,
-        t_source_ns=0,
-        t_capture_ns=0,
-        t_utc_ns=0,
-        T_world_ego=SE2(),
-        cov=(0.0,) * 9,
-        valid=True,
-        vehicles=(vehicle,),
-        lanes=lanes,
-    )
+    vehicle = new_vehicle(7, SE2(54.5, -0.2, 0.0), velocity_mps=(14.0, 0.0))
+    estimate = new_estimate(vehicles=(vehicle,), lanes=lanes)
     scores = VehicleScores()
     scores.add(estimate, bodies, truth)
     report = scores.report()
@@ -854,14 +839,8 @@ def test_merging_lane_reports_its_end() -> None:
 
 def test_lines_are_drawn_behind_road_users() -> None:
     lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.75), line(2, -1.75)), 0)
-    car = VehicleEstimate(
-        vehicle=3, T_world_vehicle=SE2(14.0, 1.75, 0.0), cov=(0.0,) * 9, velocity_mps=(0.0, 0.0),
-        velocity_cov=(0.0,) * 4, age_ns=0, frames=1, length_m=4.0, width_m=1.8, height_m=1.5,
-    )  # fmt: skip
-    estimate = Estimate(
-        epoch=0, frame_id=0, t_source_ns=0, t_capture_ns=0, t_utc_ns=0, T_world_ego=SE2(), cov=(0.0,) * 9, valid=True,
-        vehicles=(car,), lanes=lanes,
-    )  # fmt: skip
+    car = new_vehicle(3, SE2(14.0, 1.75, 0.0), length_m=4.0, width_m=1.8, height_m=1.5)
+    estimate = new_estimate(vehicles=(car,), lanes=lanes)
     image = np.full((CAMERA.height_px, CAMERA.width_px, 3), 90, np.uint8)
     with_lines = SideBySide(CAMERA).draw(image, estimate, [], [])
     without = SideBySide(CAMERA).draw(image, msgspec.structs.replace(estimate, lanes=None), [], [])
@@ -879,12 +858,8 @@ def test_the_map_has_each_line_once(tmp_path: Path) -> None:
     path = tmp_path / "map.geojson"
     lines = LineMap(path)
     for k in range(30):
-        pose = SE2(float(k), 0.0, 0.0)
-        estimate = Estimate(
-            epoch=0, frame_id=k, t_source_ns=k * 10**8, t_capture_ns=0, t_utc_ns=0, T_world_ego=pose, cov=(0.0,) * 9,
-            valid=True, lanes=Lanes(lines=(line(4, 1.75), line(5, -1.75)), age_ns=0),
-        )  # fmt: skip
-        lines.add(estimate, SE2())
+        both = Lanes(lines=(line(4, 1.75), line(5, -1.75)), age_ns=0)
+        lines.add(new_estimate(frame_id=k, t_source_ns=k * 10**8, T_world_ego=SE2(float(k)), lanes=both), SE2())
     lines.close()
     features = json.loads(path.read_text())["features"]
     assert [feature["properties"]["line"] for feature in features] == [4, 5]
@@ -898,10 +873,7 @@ def test_the_map_has_each_line_once(tmp_path: Path) -> None:
 
 def test_foxglove_draws_lines_where_they_are() -> None:
     lanes = EgoLane().lanes((line(4, 1.75), line(5, -1.75, LineKind.EDGE)), 0)
-    estimate = Estimate(
-        epoch=0, frame_id=0, t_source_ns=0, t_capture_ns=0, t_utc_ns=0, T_world_ego=SE2(5.0, 1.0, 0.3), cov=(0.0,) * 9,
-        valid=True, lanes=lanes,
-    )  # fmt: skip
+    estimate = new_estimate(T_world_ego=SE2(5.0, 1.0, 0.3), lanes=lanes)
     (drawn,) = (message for channel, message in scene.from_estimate(estimate, 0) if channel == "/scene")
     assert isinstance(drawn, SceneUpdate)
     (entity,) = (entity for entity in drawn.entities if entity.id == "lanes")
