@@ -1,12 +1,11 @@
 """Local features of an image: corners with binary descriptors of 256 bits, compared by the Hamming distance.
 
-The default is upright SIFT (Lowe 2004), since a car's camera does not roll. The signs of random differences of the
-square-rooted entries (RootSIFT, Arandjelovic and Zisserman 2012) reduce a descriptor to 32 bytes, as ORB's.
+Upright SIFT (Lowe 2004), since a car's camera does not roll. The signs of random differences of the
+square-rooted entries (RootSIFT, Arandjelovic and Zisserman 2012) reduce a descriptor to 32 bytes.
 """
 
 from __future__ import annotations
 
-import enum
 from dataclasses import dataclass
 
 import cv2
@@ -21,13 +20,6 @@ SUMMED = 8  # entries of SIFT that each bit adds, and as many that it subtracts
 _SEED = 39  # of the random differences; part of the map format
 
 
-class FeatureKind(enum.StrEnum):
-    """The kinds of features; descriptors of different kinds are not comparable."""
-
-    SIFT = "sift"
-    ORB = "orb"
-
-
 @dataclass(frozen=True)
 class Features:
     """Corners of one undistorted image, in its pixels."""
@@ -40,9 +32,8 @@ class Features:
         return len(self.px)
 
 
-# Per kind: max. image width (wider images are halved), and the size of the finest corners in pixels
-WORKING_WIDTH_PX = {FeatureKind.SIFT: 700, FeatureKind.ORB: 1400}
-FINEST_PX = {FeatureKind.SIFT: 2.0, FeatureKind.ORB: 31.0}
+WORKING_WIDTH_PX = 700  # wider images are halved
+FINEST_PX = 2.0  # size of the finest corners
 
 
 def _differences() -> Floats32:
@@ -58,36 +49,30 @@ def _differences() -> Floats32:
 class FeatureExtractor:
     """Extracts the features of images; deterministic."""
 
-    def __init__(self, kind: FeatureKind = FeatureKind.SIFT) -> None:
-        self._kind = kind
+    def __init__(self) -> None:
         self._differences = _differences()
-        if kind is FeatureKind.ORB:
-            self._detector = cv2.ORB_create(MAX_FEATURES, fastThreshold=10)  # type: ignore[attr-defined]
-        else:
-            self._detector = cv2.SIFT_create(  # type: ignore[attr-defined]
-                MAX_FEATURES, contrastThreshold=0.02, edgeThreshold=12
-            )
+        self._detector = cv2.SIFT_create(  # type: ignore[attr-defined]
+            MAX_FEATURES, contrastThreshold=0.02, edgeThreshold=12
+        )
 
     def __call__(self, image: NDArray[np.uint8]) -> Features:
         """Returns the features of an image, (H, W) grey or (H, W, 3) BGR."""
         grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         scale = 1.0
-        while grey.shape[1] > WORKING_WIDTH_PX[self._kind]:
+        while grey.shape[1] > WORKING_WIDTH_PX:
             height_px, width_px = grey.shape
             grey, scale = cv2.resize(grey, (width_px // 2, height_px // 2), interpolation=cv2.INTER_AREA), scale * 2.0
         corners = self._detector.detect(grey, None)
-        if self._kind is FeatureKind.SIFT:
-            for corner in corners:
-                corner.angle = 0.0
-            corners = _without_duplicates(corners)
+        for corner in corners:
+            corner.angle = 0.0
+        corners = _without_duplicates(corners)
         corners, descriptors = self._detector.compute(grey, corners)
         if descriptors is None or not len(corners):
             return Features(np.zeros((0, 2)), np.zeros(0), np.zeros((0, DESCRIPTOR_BYTES), np.uint8))
-        if self._kind is not FeatureKind.ORB:
-            descriptors = self._bits(descriptors)
+        descriptors = self._bits(descriptors)
         px = (np.array([corner.pt for corner in corners]) + 0.5) * scale - 0.5
         size = np.array([corner.size for corner in corners])
-        sigma_px = scale * np.clip(0.5 * np.sqrt(size / FINEST_PX[self._kind]), 0.5, 4.0)
+        sigma_px = scale * np.clip(0.5 * np.sqrt(size / FINEST_PX), 0.5, 4.0)
         return Features(px, sigma_px, descriptors)
 
     def _bits(self, descriptors: Floats32) -> NDArray[np.uint8]:

@@ -8,7 +8,6 @@ features. `gnss`: fixes that jump. `size`: simulated descriptors.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +19,6 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
-from birdslam.loops.features import FeatureExtractor, FeatureKind, Features
 from birdslam.loops.localiser import Localisation
 from birdslam.loops.map_file import decode_map, encode_map
 from birdslam.loops.map_pose import MapState
@@ -47,13 +45,12 @@ def run(arguments: list[str]) -> None:
     parser = benchmark_parser("loops", label)
     add_data(parser)
     parser.add_argument("--part", nargs="+", choices=PARTS, default=PARTS)
-    parser.add_argument("--features", nargs="+", choices=list(FeatureKind), default=[FeatureKind.SIFT])
     parser.add_argument("--way", type=float, default=2000.0, metavar="M", help="length of the simulated loop")
     options = parser.parse_args(arguments)
     cv2.setNumThreads(1)
-    with Ledger(options.output, label, features=[str(kind) for kind in options.features], way_m=options.way) as ledger:
+    with Ledger(options.output, label, way_m=options.way) as ledger:
         if "recorded" in options.part:
-            recorded(ledger, options.data, [FeatureKind(kind) for kind in options.features])
+            recorded(ledger, options.data)
         if "loop" in options.part:
             simulated.loop(ledger, options.way)
         if "gnss" in options.part:
@@ -72,7 +69,7 @@ def estimated(uri: str) -> Iterator[Seen]:
                 yield estimate, frame.image
 
 
-def recorded(ledger: Ledger, data: Path, kinds: Sequence[FeatureKind]) -> None:
+def recorded(ledger: Ledger, data: Path) -> None:
     """The two passes, and other streets in their maps."""
 
     def read(name: str) -> tuple[Camera, list[Seen]]:
@@ -81,41 +78,23 @@ def recorded(ledger: Ledger, data: Path, kinds: Sequence[FeatureKind]) -> None:
 
     passes = {name: read(f"two_passes/{name}") for name in ("left", "right")}
     others = {Path(name).name: read(name) for name in OTHERS if (data / name).exists()}
-    for kind in kinds:
-        for name, other, side in (("left", "right", -1.0), ("right", "left", 1.0)):
-            camera, frames = passes[name]
-            extract = TimedExtractor(kind)
-            kept = encode_map(build_map(camera, frames, extract))
-            found = localise(*passes[other], kept, kind)
-            truth = [estimate.T_world_ego @ SE2(0.0, side * BASELINE_M, 0.0) for estimate, _ in frames]
-            row = evaluate(found, truth) | {"MB_a_km": round(len(kept) / 1e3 / max(decode_map(kept).length_m, 1.0), 2)}
-            row["features_ms"] = round(float(np.median(extract.took_ms)), 1)
-            ledger.add(f"{kind}: {other} in the map of {name}", row_text(row), **row, text=row_text(row))
-            for street, (street_camera, drive) in others.items():
-                states = localise(street_camera, drive, kept, kind).poses
-                text = f"{len(states)} of {len(drive)} frames localised, all of them falsely"
-                title = f"{kind}: {street} in the map of {name}"
-                ledger.add(title, text, false=len(states), frames=len(drive), text=text)
+    for name, other, side in (("left", "right", -1.0), ("right", "left", 1.0)):
+        camera, frames = passes[name]
+        kept = encode_map(build_map(camera, frames))
+        found = localise(*passes[other], kept)
+        truth = [estimate.T_world_ego @ SE2(0.0, side * BASELINE_M, 0.0) for estimate, _ in frames]
+        row = evaluate(found, truth) | {"MB_a_km": round(len(kept) / 1e3 / max(decode_map(kept).length_m, 1.0), 2)}
+        ledger.add(f"{other} in the map of {name}", row_text(row), **row, text=row_text(row))
+        for street, (street_camera, drive) in others.items():
+            states = localise(street_camera, drive, kept).poses
+            text = f"{len(states)} of {len(drive)} frames localised, all of them falsely"
+            ledger.add(f"{street} in the map of {name}", text, false=len(states), frames=len(drive), text=text)
 
 
-class TimedExtractor(FeatureExtractor):
-    """Measures the CPU time per image in milliseconds."""
-
-    def __init__(self, kind: FeatureKind) -> None:
-        super().__init__(kind)
-        self.took_ms: list[float] = []
-
-    def __call__(self, image: NDArray[np.uint8]) -> Features:
-        begun_s = time.process_time()
-        out = super().__call__(image)
-        self.took_ms.append(1e3 * (time.process_time() - begun_s))
-        return out
-
-
-def build_map(camera: Camera, frames: Iterable[Seen], extract: FeatureExtractor) -> PlaceMap:
+def build_map(camera: Camera, frames: Iterable[Seen]) -> PlaceMap:
     """The map of a drive."""
     place_map = PlaceMap(MapCamera.of(camera))
-    session = MapSession(camera, place_map, True, extract)
+    session = MapSession(camera, place_map, True)
     for estimate, image in frames:
         session.step(estimate, image)
     session.finish()
@@ -134,8 +113,8 @@ class Localised:
         return [row for row in self.rows if row.state is MapState.LOCALISED]
 
 
-def localise(camera: Camera, frames: Iterable[Seen], kept: bytes, kind: FeatureKind) -> Localised:
-    session, trajectory = MapSession(camera, decode_map(kept), False, FeatureExtractor(kind)), MapTrajectory()
+def localise(camera: Camera, frames: Iterable[Seen], kept: bytes) -> Localised:
+    session, trajectory = MapSession(camera, decode_map(kept), False), MapTrajectory()
     rows: list[Localisation] = []
     for estimate, image in frames:
         rows += trajectory.add(session.step(estimate, image), estimate)
@@ -166,7 +145,6 @@ def row_text(row: dict[str, Any]) -> str:
         return f"0 of {row['frames']} localised"
     x, y, yaw = row["within_2_sigma"]
     size = f", {row['MB_a_km']} MB a km" if "MB_a_km" in row else ""
-    size += f", features of an image in {row['features_ms']:.0f} ms" if "features_ms" in row else ""
     return (
         f"{row['localised']} of {row['frames']} localised (first as frame {row['frames_to_localise']}), "
         f"median {row['median_m']:.3f} m {row['median_deg']:.3f} deg, worst {row['worst_m']:.3f} m, "
