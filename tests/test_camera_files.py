@@ -55,6 +55,40 @@ XML = """<?xml version="1.0"?>
   <data>-0.3 0.1 0.001 0.0005</data></Distortion_Coefficients>
 </opencv_storage>
 """
+OPENCV_YAML = """%YAML:1.0
+---
+image_width: 640
+image_height: 480
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 4.385e+02, 0., 3.055e+02, 0., 4.3725e+02, 2.4375e+02, 0., 0., 1. ]
+distortion_coefficients: !!opencv-matrix
+   rows: 4
+   cols: 1
+   dt: d
+   data: [ -3.0e-01, 1.0e-01, 1.0e-03, 5.0e-04 ]
+"""
+ROS = """image_width: 640
+image_height: 480
+camera_name: front
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [438.5, 0.0, 305.5, 0.0, 437.25, 243.75, 0.0, 0.0, 1.0]
+distortion_model: plumb_bob
+distortion_coefficients: {rows: 1, cols: 4, data: [-0.3, 0.1, 0.001, 0.0005]}
+"""
+ROS_MESSAGE = """header:
+  seq: 0
+height: 480
+width: 640
+distortion_model: "plumb_bob"
+D: [-0.3, 0.1, 0.001, 0.0005]
+K: [438.5, 0.0, 305.5, 0.0, 437.25, 243.75, 0.0, 0.0, 1.0]
+---
+"""
 ROS_JSON = """{"image_width": 640, "image_height": 480, "distortion_model": "plumb_bob",
  "D": [-0.3, 0.1, 0.001, 0.0005], "K": [438.5, 0, 305.5, 0, 437.25, 243.75, 0, 0, 1]}"""
 NUSCENES = """[{"token": "a", "camera_intrinsic": []},
@@ -65,6 +99,9 @@ FILES = {
     "ORB-SLAM2": ("settings.yaml", ORB_SLAM2),
     "COLMAP": ("cameras.txt", COLMAP),
     "OpenCV": ("camera.xml", XML),
+    "OpenCV's YAML": ("out.yml", OPENCV_YAML),
+    "ROS": ("camera.yaml", ROS),
+    "a message of ROS": ("camera.yaml", ROS_MESSAGE),
     "ROS as JSON": ("camera_info.json", ROS_JSON),
 }
 
@@ -81,6 +118,11 @@ def test_the_same_camera_comes_from_every_format(tmp_path: Path, kind: str) -> N
     assert (lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px) == (438.5, 437.25, 305.5, 243.75)
     assert lens.distortion == (-0.3, 0.1, 0.001, 0.0005)
     assert (lens.width_px, lens.height_px, lens.fisheye) == (640, 480, False)
+
+
+def test_an_undistorted_camera_of_kitti(tmp_path: Path) -> None:
+    lens = read_intrinsics(written(tmp_path, "calib.txt", "P2: 721.5 0 609.5 44.8 0 721.5 172.8 0.2 0 0 1 0.002\n"))
+    assert (lens.fx_px, lens.cx_px, lens.distortion, lens.width_px) == (721.5, 609.5, (), None)
 
 
 def test_an_undistorted_camera_of_nuscenes(tmp_path: Path) -> None:
@@ -135,6 +177,18 @@ def test_opencvs_models_of_distortion_reach_the_camera(tmp_path: Path, count: in
         ("a.json", ROS_JSON.replace("0.0005]", "0.0005, 0, 0]"), "6 distortion coefficients"),
         ("a.xml", XML.replace("</opencv_storage>", "<"), "not an OpenCV storage"),
         ("a.txt", "a film\n", "expected a file of KITTI, ROS"),
+        ("a.txt", "P9: 1 2 3\n", "none of P0, P2"),
+        ("a.txt", "P2: 1 2 nan 4 5 6 7 8 9 10 11 12\n", "not finite"),
+        ("a.yaml", "[1, 2", "not YAML"),
+        ("a.yaml", "- 1\n- 2\n", "has no camera"),
+        ("a.yaml", "image_width: 3\n", "neither camera_matrix nor K"),
+        ("a.yaml", ROS.replace("438.5", ".nan"), "not finite"),
+        ("a.yaml", ROS.replace("438.5", "wide"), "not a number"),
+        ("a.yaml", ROS.replace("438.5, 0.0,", "438.5, 9.0,"), "skew"),
+        ("a.yaml", ROS.replace("438.5, ", ""), "8 numbers"),
+        ("a.yaml", ROS.replace("plumb_bob", "mei"), "mei is not supported"),
+        ("a.yaml", ROS.replace("image_width: 640", "image_width: wide"), "size 'wide'"),
+        ("a.yaml", ROS + "x: !!python/object/apply:sys.exit [3]\n", "not YAML"),
     ],
 )
 def test_unusable_file_is_a_one_line_error(tmp_path: Path, name: str, text: str, message: str) -> None:
@@ -143,6 +197,11 @@ def test_unusable_file_is_a_one_line_error(tmp_path: Path, name: str, text: str,
         read_intrinsics(path)
     assert str(path) in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"a\.yaml: can't be read"):
+        read_intrinsics(tmp_path / "a.yaml")
 
 
 @given(
