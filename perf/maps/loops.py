@@ -84,11 +84,11 @@ def recorded(ledger: Ledger, data: Path) -> None:
         found = localise(*passes[other], kept)
         truth = [estimate.T_world_ego @ SE2(0.0, side * BASELINE_M, 0.0) for estimate, _ in frames]
         row = evaluate(found, truth) | {"MB_a_km": round(len(kept) / 1e3 / max(decode_map(kept).length_m, 1.0), 2)}
-        ledger.add(f"{other} in the map of {name}", row_text(row), **row, text=row_text(row))
+        ledger.add(f"{other} in the map of {name}", row_text(row), **row)
         for street, (street_camera, drive) in others.items():
             states = localise(street_camera, drive, kept).poses
             text = f"{len(states)} of {len(drive)} frames localised, all of them falsely"
-            ledger.add(f"{street} in the map of {name}", text, false=len(states), frames=len(drive), text=text)
+            ledger.add(f"{street} in the map of {name}", text, false=len(states), frames=len(drive))
 
 
 def build_map(camera: Camera, frames: Iterable[Seen]) -> PlaceMap:

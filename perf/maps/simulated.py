@@ -71,7 +71,7 @@ def loop(ledger: Ledger, way_m: float) -> None:
         f"({end_m / around * 50.0:.2f} %); worst keyframe {open_m:.2f} m by odometry, {closed_m:.2f} m in the map, "
         f"{unscaled_m:.2f} m after scaling by {scale:.4f}"
     )
-    ledger.add(f"loop of {around} m, twice", text, **row, text=text)
+    ledger.add(f"loop of {around} m, twice", text, **row)
 
 
 def gnss(ledger: Ledger, way_m: float) -> None:
@@ -115,7 +115,7 @@ def gnss(ledger: Ledger, way_m: float) -> None:
             f"{about['outliers']} of {about['fixes']} outliers, {len(wrong) // every} wrong; {took_s:.1f} s of a core"
         )
         worst = {"worst_by_odometry_m": round(begun_m, 3), "worst_m": round(worst_m, 3)}
-        ledger.add(f"GNSS: {name}", text, **worst, **about, text=text)
+        ledger.add(f"GNSS: {name}", text, **worst, **about)
 
 
 def _session(place_map: PlaceMap, extend: bool) -> MapSession:
@@ -165,7 +165,6 @@ def size(ledger: Ledger) -> None:
         ledger.add(
             f"map of {length_km} km",
             text,
-            text=text,
             keyframes=count,
             bytes=data,
             look_up_ms=[round(each, 3) for each in took_ms],

@@ -2,15 +2,14 @@
 
     python -m perf all --output DIR [--source URI] [--model ROLE=PATH]... [--thorough]
 
-The default source is the shipped drive with the shipped network. DIR gets report.json, report.md and the JSON of each
-benchmark. After Ctrl-C the report has the results so far and names the missing ones. Takes about 20 minutes without
-`--thorough`.
+The default source is the shipped drive with the shipped network. DIR gets the JSON of each benchmark, and report.md has
+what they print. After Ctrl-C the report has the results so far and names the missing ones. Takes about 20 minutes
+without `--thorough`.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import shlex
 import signal
 import subprocess
@@ -18,12 +17,10 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from birdslam.perf.reporting import report
 from birdslam.perf.reporting.arguments import benchmark_parser
-from birdslam.perf.reporting.figures import write_json
-from birdslam.perf.reporting.machine import describe
+from birdslam.perf.reporting.machine import describe, describe_text
+from birdslam.runtime.environment import INTERRUPTED_STATUS
 
 label = "all benchmarks, and their report"
 
@@ -70,50 +67,46 @@ def run(arguments: list[str]) -> int:
         parser.error(f"{unknown[0]!r} is not a step")
     options.output.mkdir(parents=True, exist_ok=True)
     command = f"python -m perf {shlex.join(sys.argv[1:])}"
-    head = {"command": command, "source": options.source, "models": options.model, "machine": describe()}
-    outcome: dict[str, str] = {}
+    parts = [f"# BirdSLAM's performance on this machine\n\n    {command}\n\n{describe_text(describe())}"]
     chosen = [step for step in STEPS if step.file in only]
+    outcomes = []
     for number, step in enumerate(chosen, 1):
         print(f"\n[{number}/{len(chosen)}] {step.file}", flush=True)
         begun_s = time.monotonic()
-        outcome[step.file] = run_step(step, options)
-        print(f"[{number}/{len(chosen)}] {step.file}: {outcome[step.file]} in {time.monotonic() - begun_s:.0f} s")
-        _write(options.output, head, outcome)
-        if outcome[step.file] == "interrupted":
-            return 130
-    return int(any(how.startswith("failed") for how in outcome.values()))
+        outcome, printed = run_step(step, options)
+        print(f"[{number}/{len(chosen)}] {step.file}: {outcome} in {time.monotonic() - begun_s:.0f} s")
+        parts.append(f"## {step.file}: {outcome}\n\n```text\n{printed.strip()}\n```")
+        (options.output / "report.md").write_text("\n\n".join(parts) + "\n", encoding="utf-8")
+        if outcome == "interrupted":
+            return INTERRUPTED_STATUS
+        outcomes.append(outcome)
+    return int(any(outcome.startswith("failed") for outcome in outcomes))
 
 
-def run_step(step: Step, options: argparse.Namespace) -> str:
-    """Runs a step, with its output on the terminal; returns its outcome."""
+def run_step(step: Step, options: argparse.Namespace) -> tuple[str, str]:
+    """Runs a step, with its output on the terminal; returns its outcome and the output."""
     file = options.output / f"{step.file}.json"
     file.unlink(missing_ok=True)
     command = [sys.executable, "-m", "birdslam.perf", step.benchmark, "--output", str(file)]
     command += shlex.split(step.thorough if options.thorough else step.quick)
     if step.on_source:
         command += ["--source", options.source, *(part for model in options.model for part in ("--model", model))]
-    process = subprocess.Popen(command, start_new_session=True)
+    printed = []
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
+    assert process.stdout is not None
     try:
+        for line in process.stdout:
+            print(line, end="", flush=True)
+            printed.append(line)
         status = process.wait()
     except KeyboardInterrupt:
         process.send_signal(signal.SIGINT)
         try:
-            process.wait(END_S)
+            printed.append(process.communicate(timeout=END_S)[0])
         finally:
             process.kill()
-        return "interrupted"
+        return "interrupted", "".join(printed)
     if status == 0:
-        return "complete"
-    return "complete, but a budget or bound is not met" if status == 1 and file.is_file() else f"failed ({status})"
-
-
-def _write(folder: Path, head: dict[str, Any], outcome: dict[str, str]) -> None:
-    """Writes the report, after each step."""
-    benchmarks = {}
-    for name in outcome:
-        file = folder / f"{name}.json"
-        if file.is_file():
-            benchmarks[name] = json.loads(file.read_text(encoding="utf-8"))
-    content = {**head, "outcome": outcome, "benchmarks": benchmarks}
-    write_json(folder / "report.json", content)
-    report.write(folder, content)
+        return "complete", "".join(printed)
+    missed = status == 1 and file.is_file()
+    return "complete, but a budget or bound is not met" if missed else f"failed ({status})", "".join(printed)
