@@ -219,4 +219,4 @@ def test_lines_against_masks_of_lines(tmp_path: Path) -> None:
     assert score.error_px < 1.5
     assert line_masks.report_of([score]).f1 == pytest.approx(0.8)
     with pytest.raises(DatasetError, match="no pairs"):
-        line_masks.find_images(tmp_path)
+        line_masks.find_pairs(tmp_path)

@@ -5,7 +5,6 @@ A folder holds pairs image_N.png, ego_lane_N.png. In a mask magenta is the ego's
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.bench.lanes.paint_masks import read
+from birdslam.bench.lanes.image_masks import Pair, numbered_pairs
 from birdslam.geometry import bev
 from birdslam.geometry.arrays import Bools, Floats, Ints
 from birdslam.geometry.camera import Camera, GroundPlane
@@ -31,15 +30,6 @@ FOCAL_PX, CENTRE_PX, HEIGHT_M = 721.5377, (609.5593, 172.854), 1.65
 MAX_DISTANCE_M = 30.0  # of the comparison
 HALF_WIDTH_M, CELL_M = 10.0, 0.05  # of its grid
 LANE, IGNORED = (255, 0, 255), (0, 0, 0)  # BGR
-
-
-@dataclass(frozen=True)
-class Pair:
-    """An image and its mask."""
-
-    number: int
-    image: Path
-    mask: Path
 
 
 class StillScore(msgspec.Struct, frozen=True, kw_only=True):
@@ -64,26 +54,7 @@ class StillsReport(msgspec.Struct, frozen=True, kw_only=True):
 
 def find_pairs(folder: Path) -> list[Pair]:
     """The pairs of a folder by their number. Raises DatasetError where there are none, or an image has no mask."""
-    pairs = []
-    for image in folder.glob("image_*.png"):
-        match = re.fullmatch(r"image_(\d+)\.png", image.name)
-        if match is None:
-            continue
-        mask = folder / f"ego_lane_{match[1]}.png"
-        if not mask.is_file():
-            raise DatasetError(f"{image}: has no mask {mask.name} beside it")
-        pairs.append(Pair(int(match[1]), image, mask))
-    if not pairs:
-        raise DatasetError(f"{folder}: holds no pairs image_N.png, ego_lane_N.png")
-    return sorted(pairs, key=lambda pair: pair.number)
-
-
-def read_pair(pair: Pair) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """(H, W, 3) BGR image and mask. Raises DatasetError."""
-    image, mask = read(pair.image), read(pair.mask)
-    if image.shape != mask.shape:
-        raise DatasetError(f"{pair.mask}: is of another size than {pair.image.name}")
-    return image, mask
+    return numbered_pairs(folder, "png", "ego_lane")
 
 
 def camera_of(image: NDArray[np.uint8], stated: Camera | None) -> Camera:

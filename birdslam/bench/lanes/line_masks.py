@@ -5,7 +5,6 @@ A folder holds pairs image_N.jpg, lines_N.png; in a mask each line has one grey 
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import msgspec
@@ -13,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.bench.figures import mean, number
+from birdslam.bench.lanes.image_masks import Pair, numbered_pairs
 from birdslam.bench.lanes.kitti_road import Still
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.lanes.outline import line_px
-from birdslam.sources.recording import DatasetError
 from birdslam.types import LineKind
 
 NEAR_PX, MIN_NEAR_RATIO = 20.0, 0.85  # a line is found if so many of its rows are so near (TuSimple)
@@ -47,18 +46,9 @@ class LineMasksReport(msgspec.Struct, frozen=True, kw_only=True):
     by_image: tuple[LineMaskScore, ...]
 
 
-def find_images(folder: Path) -> list[tuple[Path, Path]]:
+def find_pairs(folder: Path) -> list[Pair]:
     """Images with their masks. Raises DatasetError where there are none, or one has no mask."""
-    pairs = []
-    for image in sorted(folder.glob("image_*.jpg")):
-        if (match := re.fullmatch(r"image_(\d+)\.jpg", image.name)) is not None:
-            mask = folder / f"lines_{match[1]}.png"
-            if not mask.is_file():
-                raise DatasetError(f"{image}: has no mask {mask.name} beside it")
-            pairs.append((image, mask))
-    if not pairs:
-        raise DatasetError(f"{folder}: holds no pairs image_N.jpg, lines_N.png")
-    return pairs
+    return numbered_pairs(folder, "jpg", "lines")
 
 
 def camera_of(image: NDArray[np.uint8]) -> Camera:

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.bench.figures import mean
+from birdslam.bench.lanes.image_masks import Pair, checked
 from birdslam.geometry.arrays import Bools
-from birdslam.sources.recording import DatasetError
 
 MARKING, OWN_CAR = (0, 0, 255), (255, 0, 204)  # BGR
 REACH_PX = 5  # from a pixel of the one to one of the other
@@ -43,24 +43,11 @@ class PaintReport(msgspec.Struct, frozen=True, kw_only=True):
     by_image: tuple[PaintScore, ...]
 
 
-def find_images(folder: Path) -> list[tuple[Path, Path]]:
+def find_pairs(folder: Path) -> list[Pair]:
     """Images with their masks. Raises DatasetError where there are none, or one has no mask."""
     images = sorted((folder / "imgs").glob("*.png"))
-    if not images:
-        raise DatasetError(f"{folder}: holds no imgs/NAME.png with masks/NAME.png")
-    pairs = [(image, folder / "masks" / image.name) for image in images]
-    for image, mask in pairs:
-        if not mask.is_file():
-            raise DatasetError(f"{image}: has no mask {mask}")
-    return pairs
-
-
-def read(path: Path) -> NDArray[np.uint8]:
-    """(H, W, 3) BGR. Raises DatasetError."""
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if image is None:
-        raise DatasetError(f"{path}: can't be read as an image")
-    return np.asarray(image, np.uint8)
+    pairs = [Pair(number, image, folder / "masks" / image.name) for number, image in enumerate(images)]
+    return checked(pairs, f"{folder}: holds no imgs/NAME.png with masks/NAME.png")
 
 
 def score_paint(name: str, image: NDArray[np.uint8], found: Bools, mask: NDArray[np.uint8]) -> PaintScore:

@@ -10,9 +10,13 @@ from birdslam.bench.lanes.paint_masks import PaintReport
 from birdslam.bench.lanes.true_borders import text_of as borders_text
 from birdslam.runtime.cli.arguments import add_config, add_pipeline
 from birdslam.runtime.configuration import ConfigurationError
-from birdslam.runtime.evaluation.border_lanes import evaluate_borders, evaluate_later
-from birdslam.runtime.evaluation.drive_lanes import DriveReport, evaluate_drive
-from birdslam.runtime.evaluation.lanes import draw_frame_lanes
+from birdslam.runtime.evaluation.lanes import (
+    DriveReport,
+    draw_frame_lanes,
+    evaluate_borders,
+    evaluate_drive,
+    evaluate_later,
+)
 from birdslam.runtime.evaluation.still_lanes import REPORT, evaluate_line_masks, evaluate_paint, evaluate_stills
 from birdslam.runtime.options import configuration_of
 
