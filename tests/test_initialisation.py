@@ -15,7 +15,7 @@ from birdslam.odometry.corners.two_view import initial_two_view, two_view_from_p
 from birdslam.odometry.odometry import Odometry
 from birdslam.odometry.road.alignment import RoadAlignConfig, RoadAligner
 from birdslam.odometry.road.scale_search import best_length, explained_by_motion
-from birdslam.perf.accuracy.drives import Task, errors, follow, read
+from birdslam.perf.accuracy.drives import errors, follow, read
 from birdslam.sources.opening import open_recording
 from birdslam.types import Status
 
@@ -172,8 +172,8 @@ START_IMAGES = 13
 
 def _starts(data_dir: Path, sequence: str, every: int, mirrored: bool) -> tuple[list[dict[str, Any]], int]:
     """Cold starts of a KITTI sequence over START_IMAGES images each; how many motions they have in all."""
-    task = Task(f"kitti:{data_dir / 'kitti_odometry' / 'sequences' / sequence}", "", mirrored, 1, 1, 0, None)
-    drive, rows, motions = read(task)[1], [], 0
+    recording = open_recording(f"kitti:{data_dir / 'kitti_odometry' / 'sequences' / sequence}")
+    drive, rows, motions = read(recording, mirrored=mirrored), [], 0
     for begin in range(0, len(drive.images) - START_IMAGES, every):
         over = range(begin, begin + START_IMAGES)
         found = follow(drive, over)

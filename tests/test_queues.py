@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from birdslam.perf.accuracy.drives import follow, is_valid
-from birdslam.perf.accuracy.roads import read
+from birdslam.perf.accuracy.drives import follow, is_valid, read
 from birdslam.sources.shipped_drive import DemoRecording
 
 pytestmark = pytest.mark.numeric

@@ -22,8 +22,8 @@ import pytest
 
 from birdslam.geometry.pose import Pose, rotation_exp
 from birdslam.odometry.road.alignment import RoadAlignConfig, RoadAligner
-from birdslam.perf.accuracy.drives import Drive, follow
-from birdslam.perf.accuracy.roads import EFFECTS, measure, read
+from birdslam.perf.accuracy.drives import Drive, follow, read
+from birdslam.perf.accuracy.roads import ON_ROADS, edit_of, measure
 from birdslam.sources.shipped_drive import DIRECTORY, DemoRecording
 from birdslam.trajectory import inverse
 from birdslam.types import Status
@@ -35,7 +35,7 @@ pytestmark = pytest.mark.numeric
 
 CLIPS = Path(__file__).parent / "roads"
 NAMES = ("motorway_20", "motorway_40", "ramp_20", "ramp_21_glare", "night_street", "night_motorway")
-ON_THE_GLASS = sorted(set(EFFECTS) - {"compression"})
+ON_THE_GLASS = sorted(set(ON_ROADS) - {"compression"})
 FRAMES = 26
 QUALITY = 70  # of the clips' WebP images
 TOWN_STRIDE, TOWN_FRAMES = 3, 44  # of the shipped drive: 44 m of a street
@@ -68,16 +68,14 @@ def test_cold_starts_on_roads_have_the_right_scale() -> None:
 def test_cold_starts_behind_a_windscreen_have_the_right_scale() -> None:
     """Of 16 starts: median error 0.8 %, 90 % valid, no motion of 372 wrong while valid."""
     drives = [("motorway_40", effect) for effect in ON_THE_GLASS]
-    check_starts(
-        [measure(read(DemoRecording(directory=CLIPS / n), EFFECTS[e]()), (0, 1, 2, 4)) for n, e in drives], 0.01
-    )
+    check_starts([measure(read(DemoRecording(directory=CLIPS / n), edit_of(e)), (0, 1, 2, 4)) for n, e in drives], 0.01)
 
 
 @pytest.mark.slow
 def test_cold_starts_on_a_street_behind_a_windscreen_have_the_right_scale() -> None:
     """Of 12 starts: median error 2.2 to 2.3 %, 89 to 90 % valid, 5 or 6 of 492 motions wrong while valid."""
     town = [DemoRecording(stride=TOWN_STRIDE, directory=DIRECTORY) for _ in ON_THE_GLASS]
-    edits = [EFFECTS[effect]() for effect in ON_THE_GLASS]
+    edits = [edit_of(effect) for effect in ON_THE_GLASS]
     check_starts(
         [measure(read(one, edit, TOWN_FRAMES), (0, 2, 4)) for one, edit in zip(town, edits, strict=True)], 0.025
     )
@@ -106,7 +104,7 @@ def test_lines_along_the_road_are_not_obstructions(name: str) -> None:
 
 @pytest.mark.parametrize("effect", first(1, ["drops", "dirt", "reflection"]))
 def test_obstructions_on_a_motorway_are_reported(effect: str) -> None:
-    told = told_obstructed(read(DemoRecording(directory=CLIPS / "motorway_20"), EFFECTS[effect]()))
+    told = told_obstructed(read(DemoRecording(directory=CLIPS / "motorway_20"), edit_of(effect)))
     assert sum(told) >= 0.3 * len(told)
 
 

@@ -114,11 +114,6 @@ def from_share(kind: str, seed: int, share: float) -> Edit:
     return edit
 
 
-def from_middle(kind: str, seed: int) -> Edit:
-    """One of KINDS over the second half of the images."""
-    return from_share(kind, seed, 0.5)
-
-
 def bonnet(image: Image) -> Image:
     """The ego's bonnet along the lower edge, which reflects the image above it, blurred."""
     height, width = image.shape[:2]

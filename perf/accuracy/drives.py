@@ -1,12 +1,13 @@
-"""Recorded drives for benchmarks of the odometry: reading, estimation, and comparison with the truth."""
+"""Recorded and rendered drives for benchmarks of the odometry: reading, estimation, comparison with the truth."""
 
 from __future__ import annotations
 
 import argparse
 import itertools
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import cv2
@@ -19,10 +20,8 @@ from birdslam.geometry.arrays import Bools, Floats, Image
 from birdslam.geometry.camera import Camera, Undistorter
 from birdslam.odometry.motion import Motion
 from birdslam.odometry.odometry import Odometry
-from birdslam.perf.reporting.arguments import add_data, add_networks
 from birdslam.runtime.configuration import Configuration, load
 from birdslam.runtime.nodes.inference import Inference
-from birdslam.sources.opening import open_recording
 from birdslam.sources.recording import DatasetError, Recording
 from birdslam.sources.shipped_drive import DemoRecording
 from birdslam.status import INVALIDATING
@@ -30,48 +29,24 @@ from birdslam.trajectory import as_poses, inverse
 from birdslam.types import Frame, Status
 
 Edit = Callable[[int, int, Image], Image]
+Seen = tuple[Floats, Bools | None]  # boxes (M, 4), mask of the road
 
-SEQUENCES = (
-    "kitti_odometry/sequences/00",
-    "kitti_odometry/sequences/01",
-    "kitti_odometry/sequences/06",
-    "kitti_tracking/training/image_03/0005",
-)
 MIN_IMAGES = 13  # of a start near the end of a sequence
 MIN_DISTANCE_M = 2.0  # of a start; the scale of a stationary car is undefined
 SCALE_LIMIT, SPEED_LIMIT, SPEED_FLOOR_M = 0.05, 0.1, 0.05  # the floor is the noise of a true step
+MIN_VISIBLE_RATIO = 0.05  # of a rendered body with a box
 _MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
 
 
 @dataclass(frozen=True)
 class Drive:
-    """The images of one variant of a sequence, and the true camera poses (N, 4, 4) relative to the first image."""
+    """The images of a drive, and the true camera poses (N, 4, 4) relative to the first image."""
 
     camera: Camera
     images: list[Image]
     t_ns: list[int]
     poses: Floats
-    seen: list[tuple[Floats, Bools | None]]  # results of networks: boxes (M, 4), road mask
-
-
-@dataclass(frozen=True)
-class Task:
-    """The work of one process: one variant of one sequence."""
-
-    uri: str
-    name: str
-    mirrored: bool
-    stride: int
-    every: int
-    images: int
-    configuration: Configuration | None  # None: without networks
-
-
-def add_drive_options(parser: argparse.ArgumentParser) -> None:
-    """Adds the options for drives and networks."""
-    parser.add_argument("sequences", nargs="*", metavar="SEQUENCE", help="kitti:DIR, or a folder of --data")
-    add_data(parser)
-    add_networks(parser)
+    seen: list[Seen]  # true bodies or results of networks: boxes (M, 4), road mask
 
 
 def networks_of(options: argparse.Namespace) -> Configuration | None:
@@ -84,51 +59,41 @@ def with_networks(models: Sequence[str]) -> Configuration:
     return load(None, {f"models.{m.partition('=')[0]}.path": m.partition("=")[2] for m in models}).as_lossless()
 
 
-def uri_of(sequence: str, data: Path) -> str:
-    """The URI of a recording, of a folder with a rendered `drive.npz`, or of a KITTI folder of the data."""
-    rendered = (Path(sequence) / "drive.npz").is_file()
-    return sequence if ":" in sequence or rendered else f"kitti:{data / sequence}"
+def read(
+    recording: Recording,
+    edit: Edit | None = None,
+    max_images: int = 10**6,
+    configuration: Configuration | None = None,
+    mirrored: bool = False,
+) -> Drive:
+    """At most `max_images` images, decoded once, undistorted and grey, on request mirrored left to right.
 
-
-def _open(task: Task) -> Recording:
-    """Opens the recording. Raises DatasetError."""
-    if ":" in task.uri:
-        return open_recording(task.uri, stride=task.stride)
-    if task.stride != 1:
-        raise DatasetError(f"{task.uri}: a rendered drive cannot be read in parts")
-    recording = DemoRecording(Path(task.uri))
-    recording.name = Path(task.uri).resolve().name
-    return recording
-
-
-def read(task: Task, edit: Edit | None = None) -> tuple[str, Drive]:
-    """The sequence with its images decoded once, undistorted and grey, mirrored on request.
-
-    `edit` takes an image's index, the number of images, and the image.
+    `edit` takes an image's index, the number of images, and the image. Without networks (`configuration`), a rendered
+    drive has the true boxes of visible bodies. Raises DatasetError.
     """
-    recording = _open(task)
     truth = recording.truth_poses()
     if truth is None:
-        raise DatasetError(f"{task.uri}: has no true poses to compare with")
-    T = recording.T_cam0_cam()
-    poses = from_first(inverse(T) @ as_poses(truth) @ T)
+        raise DatasetError(f"{recording.name}: has no true poses to compare with")
+    T, count = recording.T_cam0_cam(), min(len(recording), max_images)
+    poses = from_first(inverse(T) @ as_poses(truth[:count]) @ T)
     undistort, camera = Undistorter(recording.camera), recording.camera
-    if task.mirrored:
+    if mirrored:
         camera, poses = mirrored_camera(camera), _MIRROR @ poses @ _MIRROR
     images: list[Image] = []
     t_ns, seen = [], []
-    for frame, looked in zip(recording.frames(), _network_results(task.configuration), strict=False):
-        if frame.image is None:
-            raise DatasetError(f"{task.uri}: image {frame.index}: {frame.error}")
-        image = undistort(frame.image)
-        if edit is not None:
-            image = edit(frame.index, len(recording), image)
-        if task.mirrored:
-            image = np.ascontiguousarray(image[:, ::-1])
-        seen.append(looked(Frame(frame.index, frame.t_source_ns, frame.index, frame.index, image)))
-        images.append(image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8))
-        t_ns.append(frame.t_source_ns)
-    return recording.name, Drive(camera, images, t_ns, poses, seen)
+    with _looks(recording, configuration) as look:
+        for frame in itertools.islice(recording.frames(), count):
+            if frame.image is None:
+                raise DatasetError(f"{recording.name}: image {frame.index}: {frame.error}")
+            image = undistort(frame.image)
+            if edit is not None:
+                image = edit(frame.index, count, image)
+            if mirrored:
+                image = np.ascontiguousarray(image[:, ::-1])
+            seen.append(look(Frame(frame.index, frame.t_source_ns, frame.index, frame.index, image)))
+            images.append(image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8))
+            t_ns.append(frame.t_source_ns)
+    return Drive(camera, images, t_ns, poses, seen)
 
 
 def mirrored_camera(camera: Camera) -> Camera:
@@ -136,20 +101,26 @@ def mirrored_camera(camera: Camera) -> Camera:
     return msgspec.structs.replace(camera, cx_px=camera.width_px - 1 - camera.cx_px, roll_rad=-camera.roll_rad)
 
 
-def _network_results(configuration: Configuration | None) -> Iterator[Any]:
-    """Yields a function from an image to the networks' boxes and road, to be called for each image in order."""
+@contextmanager
+def _looks(recording: Recording, configuration: Configuration | None) -> Iterator[Callable[[Frame], Seen]]:
+    """What is seen in an image: by the networks, or the true bodies of a rendered drive; else nothing."""
     if configuration is None:
-        yield from itertools.repeat(lambda frame: (np.zeros((0, 4)), None))
+        yield partial(_true_bodies, recording)
         return
     with Inference(configuration) as inference:
 
-        def look(frame: Frame) -> tuple[Floats, Bools | None]:
+        def look(frame: Frame) -> Seen:
             found = inference.start(frame).result()
             boxes = np.zeros((0, 4)) if found.detections is None else found.detections.boxes_px
             return boxes, None if found.segmentation is None else found.segmentation.road
 
-        while True:
-            yield look
+        yield look
+
+
+def _true_bodies(recording: Recording, frame: Frame) -> Seen:
+    bodies = recording.truth_bodies(frame.frame_id) if isinstance(recording, DemoRecording) else ()
+    boxes = [body.box_px for body in bodies if body.visible > MIN_VISIBLE_RATIO]
+    return np.array(boxes, np.float64).reshape(-1, 4), None
 
 
 def cold_start(drive: Drive, over: range) -> dict[str, Any] | None:
