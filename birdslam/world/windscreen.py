@@ -14,7 +14,7 @@ from birdslam.geometry.arrays import Image
 
 Edit = Callable[[int, int, Image], Image]  # index of an image, number of images, image -> edited image
 
-KINDS = ("nothing", "drops", "rain", "drops_defocused", "dirt", "reflection")
+KINDS = ("drops", "rain", "drops_defocused", "dirt", "reflection")
 # Defocused drops: number, radius and blur in image widths, opacity, refraction towards their centre, and light that
 # they add (sky) or absorb
 _DEFOCUSED_DROPS, _DEFOCUSED_RADIUS_REL, _DEFOCUS_REL = 45, (0.012, 0.04), 0.006
@@ -37,7 +37,7 @@ class Overlay:
             self._lens = _Lens(width_px, height_px, seed)
             return
         rng = np.random.default_rng(seed)
-        count = {"drops": 60, "rain": 1200, "dirt": 45, "reflection": 40}.get(kind, 0)
+        count = {"drops": 60, "rain": 1200, "dirt": 45, "reflection": 40}[kind]
         cover = np.zeros((height_px, width_px), np.float32)  # opacity of each pixel
         brightness = np.zeros((height_px, width_px), np.float32)  # of the overlay
         for _ in range(count):
@@ -60,8 +60,6 @@ class Overlay:
 
     def draw(self, image: Image) -> Image:
         """(H, W) grey or (H, W, 3)."""
-        if self.kind == "nothing":
-            return image
         if self.kind == "drops_defocused":
             return self._lens.draw(image)
         seen = image.reshape(*image.shape[:2], -1).astype(np.float32)

@@ -116,8 +116,7 @@ class Walk:
 class SimulatedOdometry(WithoutImages):
     """An EgoMotion of the front end from `poses` (N, 4, 4): `T_first_i` of the camera; frame ids are their rows.
 
-    `landmarks` gives the CP edges. `true_poses`, where `poses` are already someone's odometry, say where the camera was
-    when it saw the landmarks.
+    `landmarks` gives the CP edges.
     """
 
     def __init__(
@@ -126,7 +125,6 @@ class SimulatedOdometry(WithoutImages):
         poses: Transform,
         config: SimulationConfig,
         rng: np.random.Generator,
-        true_poses: Transform | None = None,
     ) -> None:
         self.camera = camera
         self.config = config
@@ -138,7 +136,7 @@ class SimulatedOdometry(WithoutImages):
         self._rise, self._side = Walk(noise.rise_rad, 1, rng), Walk(noise.side_rad, 1, rng)
         self._scale = Walk(noise.log_scale, 1, rng)
         self._pitch, self._roll = Walk(noise.landmark_pitch_rad, 1, rng), Walk(noise.landmark_roll_rad, 1, rng)
-        self._ego = _on_road(camera, poses if true_poses is None else true_poses)
+        self._ego = _on_road(camera, poses)
         self._landmarks: dict[int, Floats] = {}  # in world
         self._next_landmark = 0
         self._last_frame: int | None = None
