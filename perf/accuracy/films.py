@@ -59,7 +59,6 @@ class Film:
     uri: str  # {data} is the folder of data
     gps: str | None = None  # file of times and speeds
     speed_mps: float | None = None  # constant speed
-    between_mps: tuple[float, float] | None = None  # bounds of its speed
     camera: str | None = None  # the film whose camera file it shares
 
 
@@ -71,7 +70,6 @@ FILMS = {
         "video:{data}/dashcam/town_overtaken.mp4", gps="dashcam/town_overtaken_gps.csv", camera="town_72"
     ),
     "motorway": Film("video:{data}/highway/solidWhiteRight.mp4", speed_mps=25.4),
-    "rain": Film("video:{data}/dashcam/rain.mp4", between_mps=(15.0, 35.0)),
     "00": Film("kitti:{data}/kitti_odometry/sequences/00"),
     "0005": Film("kitti:{data}/kitti_tracking/training/image_03/0005"),
     "06": Film("kitti:{data}/kitti_odometry/sequences/06"),
@@ -108,7 +106,6 @@ def measure_all(options: argparse.Namespace) -> None:
         for name in options.films or DEFAULT:
             film = FILMS[name]
             camera = camera_of(name)
-            between_mps = film.between_mps or (0.0, math.inf)
             recording = open_recording(film.uri.format(data=options.data), camera)
             true_mps = truth(film, recording, options.data)
             for part in options.part or PARTS:
@@ -120,7 +117,7 @@ def measure_all(options: argparse.Namespace) -> None:
                         steps = drive(recording, variant, span_s, true_mps, seen)
                         if not steps or steps[-1].t_s <= BEGINNING_S:
                             continue  # the film ends before its speed counts
-                        figures = summary(steps, between_mps)
+                        figures = summary(steps)
                         unchanged = unchanged or figures
                         figures["way_over_unchanged"] = over(figures, unchanged)
                         started = "" if begin_s == 0.0 else f", from {begin_s:g} s"
@@ -195,9 +192,6 @@ def truth(film: Film, recording: Recording, data: Path) -> TrueSpeed:
     if film.speed_mps is not None:
         speed_mps = film.speed_mps
         return lambda begin_s, end_s: speed_mps
-    if film.between_mps is not None:
-        middle_mps = 0.5 * sum(film.between_mps)
-        return lambda begin_s, end_s: middle_mps
     if film.gps is not None:
         t_s, *_, mps = np.loadtxt(data / film.gps, delimiter=",", skiprows=1).T
         return lambda begin_s, end_s: float(np.interp(0.5 * (begin_s + end_s), t_s, mps))

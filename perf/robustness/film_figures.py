@@ -25,8 +25,8 @@ class Step(NamedTuple):
     stands: bool = False  # whether it reports standstill
 
 
-def summary(steps: Sequence[Step], between_mps: tuple[float, float] = (0.0, np.inf)) -> dict[str, Any]:
-    """The results of a row; `between_mps` are the bounds of the true speed."""
+def summary(steps: Sequence[Step]) -> dict[str, Any]:
+    """The results of a row."""
     t_s, _, speed_mps, true_mps, valid, sigma_rel, stands = _columns(steps)
     ratio = speed_mps / np.maximum(true_mps, 0.1)
     late = t_s > BEGINNING_S
@@ -43,7 +43,6 @@ def summary(steps: Sequence[Step], between_mps: tuple[float, float] = (0.0, np.i
         "by_second": (by_second := _by_second(steps)),
         "beyond_s": _beyond_s(steps, by_second),
         "standstill": int((stands & (true_mps > MIN_SPEED_MPS)).sum()),
-        "outside": int((valid & ((speed_mps < between_mps[0]) | (speed_mps > between_mps[1]))).sum()),
     }
 
 
@@ -92,7 +91,7 @@ def row_text(figures: dict[str, Any]) -> str:
         f"{_text(figures['speed_over_truth'], '.3f')} +- {_text(figures['deviation'], '.1%')}  over the unchanged "
         f"{_text(figures.get('way_over_unchanged'), '.3f')}  by seconds "
         + " ".join(_text(ratio, ".2f") for ratio in figures["by_second"])
-        + f"  {figures['beyond_s']} s beyond 2 sigma  standstill {figures['standstill']}  outside {figures['outside']}"
+        + f"  {figures['beyond_s']} s beyond 2 sigma  standstill {figures['standstill']}"
     )
 
 
