@@ -300,6 +300,19 @@ def test_lines_off_their_paint_are_detected_again(aside_m: float, turned_rad: fl
     assert max(map(max, off[13:])) < 0.15
 
 
+def test_road_edges_are_kept_when_paint_appears() -> None:
+    tracker, edges = LineTracker(CAMERA), []
+    for k in range(16):
+        pose = SE2(2.0 * k, 0.0, 0.0)
+        image, masks = picture(pose, (0.3,) if k >= 8 else (), (False,) if k >= 8 else ())
+        tracker.update(pose, CAMERA.ground, (0.003, 0.0), image, masks, NOBODY)
+        lines = tracker.lines().at(pose)
+        edges.append({line.line for line in lines if line.kind is LineKind.EDGE})
+    assert len(edges[7]) == 2
+    assert edges[7] <= edges[-1]
+    assert any(abs(line.offset_m - 0.3) < 0.1 for line in lines)
+
+
 def test_line_off_its_paint_yields_to_the_one_on_it() -> None:
     tracker = LineTracker(CAMERA)
 

@@ -108,11 +108,11 @@ class LineTracker:
         if not len(self._filter):
             return
         points, of, seen = self._correct(view, paint, sigma_pitch_rad, travelled_m, first_tilt_rad, search_tilt)
-        if self._is_lost(view, paint, seen):
+        explained_m = _measure_explained_m(points, seen)
+        if self._is_lost(view, points, explained_m):
             self._yield_core()
             shape, found = self._search(view, paint, 0.0)
-            before = _measure_explained_m(paint, self._tracks, seen)
-            if sum(peak.evidence_m for kind, peak in found if kind == PAINT) > BETTER_RATIO * before:
+            if sum(peak.evidence_m for _, peak in found) > BETTER_RATIO * explained_m:
                 self._restart_filter(shape, found)
                 points, of, seen = self._correct(view, paint, sigma_pitch_rad, RESTART_M, 0.0, search_tilt)
         if not self._filter.valid_lines().all():
@@ -225,13 +225,13 @@ class LineTracker:
         )
         return points, of, seen
 
-    def _is_lost(self, view: RoadView, paint: LinePoints, seen: list[Support]) -> bool:
-        """Whether most of what a network calls paint lies on none of the lines, though these are in view.
+    def _is_lost(self, view: RoadView, points: LinePoints, explained_m: float) -> bool:
+        """Whether most paint and edges by a network lie on none of the lines, though these are in view.
 
         Where vehicles hide all of them, the paint beside is another line's and says nothing of theirs.
         """
-        near_m = float(paint.weight[paint.masked & (paint.x_m < MAX_SEARCH_M)].sum())
-        if near_m <= LOST_M or _measure_explained_m(paint, self._tracks, seen) >= LOST_RATIO * near_m:
+        near_m = float(points.weight[points.masked & (points.x_m < MAX_SEARCH_M)].sum())
+        if near_m <= LOST_M or explained_m >= LOST_RATIO * near_m:
             return False
         there = (view.x_m > NEAR_M) & (view.x_m < MAX_SEARCH_M)
         painted = [k for k, track in enumerate(self._tracks) if track.kind == PAINT]
@@ -372,11 +372,10 @@ class LineTracker:
         )
 
 
-def _measure_explained_m(paint: LinePoints, tracks: list[Track], seen: list[Support]) -> float:
-    """Metres of the paint that lies on lines; paint's points come first among those of an update."""
-    on = [support.points for track, support in zip(tracks, seen, strict=True) if track.kind == PAINT]
-    mine = np.concatenate([np.zeros(0, np.int64), *on])
-    return float(paint.weight[mine][paint.masked[mine] & (paint.x_m[mine] < MAX_SEARCH_M)].sum())
+def _measure_explained_m(points: LinePoints, seen: list[Support]) -> float:
+    """Metres of a network's paint and edges that lie on lines."""
+    mine = np.concatenate([np.zeros(0, np.int64), *(support.points for support in seen)])
+    return float(points.weight[mine][points.masked[mine] & (points.x_m[mine] < MAX_SEARCH_M)].sum())
 
 
 def _length_m(points: LinePoints) -> float:
