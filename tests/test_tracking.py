@@ -119,6 +119,19 @@ def test_heading_of_an_oncoming_car_follows_its_motion() -> None:
     assert track.velocity_mps[0] == pytest.approx(-10.0, abs=1.5)
 
 
+@pytest.mark.parametrize(("sigmas_mps", "turned"), [((3.0, 0.3), 0.12), ((0.3, 5.0), 0.0), ((5.0, 5.0), 0.0)])
+def test_a_direction_is_as_certain_as_the_velocity_across_it(sigmas_mps: tuple[float, float], turned: float) -> None:
+    drive = Drive(noise_px=0.3)
+    track = [drive.step(SE2(0.5 * k, 0.0, 0.0), [SE2(20.0 + 1.5 * k, 3.0)]) for k in range(10)][-1][0]
+    assert track.is_yaw_known
+    track.yaw_rad, track.sigma_yaw_rad = 0.0, 0.1
+    track.velocity_mps = np.array([10.0, 2.0])
+    across = SE2(yaw_rad=math.atan2(2.0, 10.0)).rotation()
+    track.kinematic_cov[2:, 2:] = across @ np.diag(np.square(sigmas_mps)) @ across.T
+    drive.tracker.yaw.correct_by_motion(0, track)
+    assert track.yaw_rad == pytest.approx(turned, abs=0.02)
+
+
 def test_crossing_cars_do_not_swap_ids() -> None:
     drive = Drive(noise_px=0.3)
     history: dict[int, list[float]] = {}

@@ -40,17 +40,18 @@ class YawFilter:
         """Corrects the yaw by the direction of a significant motion."""
         if track.is_stationary or track.observation.is_cut_at_side:
             return
-        vx, vy = track.velocity_mps.tolist()
+        (vx, vy), cov, config = track.velocity_mps.tolist(), track.kinematic_cov[2:, 2:], self.config
         speed = math.hypot(vx, vy)
-        sigma = math.sqrt(max(float(np.trace(track.kinematic_cov[2:, 2:])) / 2.0, 1e-12))
-        config = self.config
-        if speed < max(config.moving_mps, config.moving_sigma * sigma):
+        if speed < config.moving_mps:
+            return
+        if track.velocity_mps @ np.linalg.solve(cov, track.velocity_mps) < config.moving_sigma**2:
             return
         turn = wrap(math.atan2(vy, vx) - track.yaw_rad)
         if track.is_yaw_known and abs(turn) > math.pi / 2.0:  # front and rear were swapped
             track.yaw_rad, turn = wrap(track.yaw_rad + math.pi), wrap(turn - math.pi)
         track.front_logit = MOTION_FRONT_LOGIT
-        self._correct(row, track, turn, (config.direction_inflation * sigma / speed) ** 2)
+        across = np.array([-vy, vx]) / speed
+        self._correct(row, track, turn, (config.direction_inflation / speed) ** 2 * float(across @ cov @ across))
 
     def correct_by_body(self, row: int, track: VehicleTrack, by_depth: DepthPlace | None) -> None:
         """Corrects the yaw by the axis of the body from a network, and the front by accumulated log odds."""
