@@ -26,14 +26,14 @@ class TrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     forget_s: float = 1.0  # without a detection, of a track with an id
     sigma_accel_mps2: float = 3.0  # 1-sigma of a vehicle's acceleration
     moving_mps: float = 2.0  # minimum speed for a yaw by motion
-    moving_sigma: float = 3.0  # and minimum significance of the speed
+    moving_sigma: float = 3.0  # and minimum Mahalanobis distance of the velocity from zero
     sigma_yaw_rate_radps: float = 0.5  # 1-sigma of a vehicle's turning
     direction_inflation: float = 3.0  # of the direction's sigma: its errors are correlated over frames
     body_yaw_inflation: float = 3.0  # of the sigma of a yaw from a network, for the same reason
     sigma_yaw_unknown_rad: float = 0.2  # of a CV edge's yaw before it is measured
     sigma_yaw_moving_rad: float = 0.1  # minimum of a CV edge's yaw after it is measured
     heading: HeadingConfig = HeadingConfig()
-    standing_probability: float = 0.5  # above which motion does not correct the yaw
+    standing_probability: float = 0.5  # above which a vehicle is stationary
     late_sigma_m: float = 3.0  # maximum position sigma of a late detection for an edge in the current frame
 
 

@@ -76,7 +76,7 @@ def _extrapolated(
     known = (np.linalg.eigvalsh(drift)[:, -1] <= config.late_sigma_m**2) & np.isfinite(boxes).all(axis=1)
     R_world_then, R_now_world = T_world_then.rotation(), present.T_world_ego.rotation().T
     places_cov = R_world_then @ np.array([track.place.cov for track in tracks]) @ R_world_then.T + drift
-    places_cov += dt_s * (cov[:, 2:, :2] + cov[:, :2, 2:])  # the boxes that gave the velocity gave the place
+    places_cov += dt_s * (cov[:, 2:, :2] + cov[:, :2, 2:])  # both are from the same boxes
     places_cov = R_now_world @ places_cov @ R_now_world.T
     centres = np.array([track.place.centre_m for track in tracks])
     centres = present.T_world_ego.inverse() @ (T_world_then @ centres + steps)

@@ -108,6 +108,8 @@ def evaluate_later(configuration: Configuration, drive: str) -> tuple[BordersRep
         for _, estimate in processed:
             later.add(estimate)
     scores, worst = later.scores(int(START_S * recording.rate_hz))
+    if not worst:
+        raise DatasetError(f"{drive}: the ego reaches no road that it has seen from {START_S:g} s on")
     report = scores.report(recording.name)
     write_json(output / REPORT, report)
     return report, worst

@@ -1,7 +1,7 @@
 """The ego's lane ahead against what the line tracker finds when the ego gets there: a truth for drives without labels.
 
 Near bounds of the ego lane, placed in world by the reported poses, are the borders of the lane that earlier frames saw
-from afar. They share the odometry's drift over AHEAD_M, and a line that is wrong near and far is not found.
+from afar. The odometry's drift over AHEAD_M adds to the errors; an error that is the same near and far is not seen.
 """
 
 from __future__ import annotations
