@@ -1,5 +1,7 @@
 """Feature tracks: corners with persistent ids, tracked by pyramidal Lucas-Kanade optical flow.
 
+Each is then aligned with the patch in which it was first seen (`templates.py`), so that its error does not grow.
+
 The paper uses ORB corners (Sec. 3.1, static map initialisation); tracked corners are faster and have sub-pixel
 accuracy. Tracking needs no network result and runs in parallel to the networks, since OpenCV releases the GIL.
 """
@@ -17,6 +19,7 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.pose import Pose
+from birdslam.odometry.corners.templates import CornerTemplates
 
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
@@ -24,10 +27,10 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-# Maximum iterations and minimum step (px) of Lucas-Kanade; the backward pass needs less accuracy
-_FORWARD_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 12, 0.03)
-_BACK_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 6, 0.1)
+# Maximum iterations and minimum step (px) of Lucas-Kanade; the alignment with the templates is more accurate
+_FLOW_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 4, 0.2)
 _BACKWARD_OFFSET_PX = 2.0
+_MARGIN_PX = 2.0  # of corners to the border of the image
 # Of predicted corners: depth over the assumed depth, displacement over the image width
 _MIN_DEPTH_RATIO, _MAX_SHIFT_RATIO = 0.3, 0.4
 
@@ -53,7 +56,6 @@ class FeatureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         0.35  # minimum ratio of tracked corners; below this the prediction is wrong
     )
     search_pause: Count = 5  # images without a search after a search without success
-    max_residual_grey: Positive = 14.0  # maximum mean absolute difference of the windows
     dark_mean_grey: Annotated[float, msgspec.Meta(ge=0.0)] = 8.0  # mean below which an image is dark
     dark_std_grey: Annotated[float, msgspec.Meta(ge=0.0)] = 4.0  # standard deviation below which an image is dark
 
@@ -116,11 +118,14 @@ class FeatureTracker:
         if dark or frozen:
             self._candidate = None
             return Tracks(reference.ids, reference.px, reference.age, grey, dark=dark, frozen=frozen)
-        self._candidate = grey
+        self._candidate, self._scale = grey, np.zeros(0)
         ids, px, age = reference.ids, reference.px, reference.age
         if self._reference_image is not None and len(ids):
             followed, good = self._follow_reference(self._reference_image, grey, predict, search)
-            ids, px, age = ids[good], followed[good], age[good] + 1
+            ids, age = ids[good], age[good] + 1
+            aligned = self._templates.align(grey, ids, followed[good])
+            good = aligned.good & self._is_inside(aligned.px)
+            ids, px, age, self._scale = ids[good], aligned.px[good], age[good], aligned.scale[good]
         fresh = self._new_corners(grey, px)
         ids = np.concatenate([ids, np.arange(self._next_id, self._next_id + len(fresh))])
         self._next_id += len(fresh)
@@ -130,10 +135,12 @@ class FeatureTracker:
         """Makes the last tracked image the reference."""
         if self._candidate is not None:
             self._reference_image, self._reference = self._candidate, tracks
+            self._templates.update(self._candidate, tracks.ids, tracks.px, self._scale)
 
     def drop_reference(self) -> None:
         """Drops the reference; keeps the last image for the detection of a frozen camera."""
         self._reference_image, self._candidate = None, None
+        self._templates, self._scale = CornerTemplates(), np.zeros(0)
         no_ids = np.zeros(0, np.int64)
         self._reference = Tracks(no_ids, np.zeros((0, 2)), no_ids, np.zeros((0, 0), np.uint8))
 
@@ -183,6 +190,10 @@ class FeatureTracker:
             at, error, good = np.where(better[:, None], other, at), np.where(better, its_error, error), good | found
         return at, good
 
+    def _is_inside(self, px: Floats) -> Bools:
+        """(N,) whether corners (N, 2) are inside the image, with a margin."""
+        return ((px >= _MARGIN_PX) & (px < np.array([self.width_px, self.height_px]) - _MARGIN_PX)).all(axis=1)
+
     def _follow(
         self, then: NDArray[np.uint8], now: NDArray[np.uint8], px: Floats, start: Floats, levels: int
     ) -> tuple[Floats, Bools, Floats]:
@@ -193,23 +204,19 @@ class FeatureTracker:
         guess = np.where(np.isfinite(start), start, px).astype(np.float32).reshape(-1, 1, 2)
         there, ok, error = cv2.calcOpticalFlowPyrLK(
             then, now, here, guess.copy(), winSize=window, maxLevel=levels,
-            criteria=_FORWARD_CRITERIA, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=1e-4,
+            criteria=_FLOW_CRITERIA, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=1e-4,
         )  # fmt: skip  # type: ignore[call-overload]
         # The backward pass starts with the prediction's error (limited, since it has no pyramid) instead of at the
         # corner, so that a wrong match cannot confirm itself
         off = np.clip(there - guess, -_BACKWARD_OFFSET_PX, _BACKWARD_OFFSET_PX)
         back, ok_back, _ = cv2.calcOpticalFlowPyrLK(
             now, then, there, (here + off).astype(np.float32), winSize=window, maxLevel=0,
-            criteria=_BACK_CRITERIA, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=1e-4,
+            criteria=_FLOW_CRITERIA, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=1e-4,
         )  # fmt: skip  # type: ignore[call-overload]
         forward_backward = np.abs(back - here).reshape(-1, 2).max(axis=1)
         end: Floats = there.reshape(-1, 2).astype(np.float64)
-        margin = 2.0
-        inside = (
-            (end >= margin).all(axis=1) & (end[:, 0] < self.width_px - margin) & (end[:, 1] < self.height_px - margin)
-        )
-        good = (ok.ravel() == 1) & (ok_back.ravel() == 1) & (forward_backward < cfg.max_forward_backward_px) & inside
-        good &= (error.ravel() < cfg.max_residual_grey) & np.isfinite(end).all(axis=1)
+        good = (ok.ravel() == 1) & (ok_back.ravel() == 1) & (forward_backward < cfg.max_forward_backward_px)
+        good &= self._is_inside(end)
         return end, good, np.where(good, error.ravel(), np.inf)
 
     def _new_corners(self, grey: NDArray[np.uint8], px: Floats) -> Floats:
