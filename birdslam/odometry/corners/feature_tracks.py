@@ -64,13 +64,16 @@ class FeatureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Tracks:
     """Corners of one image. `ids` (N,) are ascending and never reused; `px` (N, 2) pixels (u right, v down).
 
-    `age` (N,) is the number of images through which a corner was tracked, 0 for a new one. `dark`: too little contrast;
-    `frozen`: identical to the previous image. In both cases the corners are those of the reference image.
+    `age` (N,) is the number of images through which a corner was tracked, 0 for a new one. `flow_px` (N, 2) is the
+    optical flow from the reference image, 0 for a new corner; it shows a stationary car better than `px`, whose errors
+    differ between images. `dark`: too little contrast; `frozen`: identical to the previous image. In both cases the
+    corners are those of the reference image.
     """
 
     ids: Ints
     px: Floats
     age: Ints
+    flow_px: Floats
     image: NDArray[np.uint8]  # (H, W) grey
     dark: bool = False
     frozen: bool = False
@@ -117,19 +120,23 @@ class FeatureTracker:
         reference = self._reference
         if dark or frozen:
             self._candidate = None
-            return Tracks(reference.ids, reference.px, reference.age, grey, dark=dark, frozen=frozen)
+            flow = np.zeros_like(reference.px)
+            return Tracks(reference.ids, reference.px, reference.age, flow, grey, dark=dark, frozen=frozen)
         self._candidate, self._scale = grey, np.zeros(0)
-        ids, px, age = reference.ids, reference.px, reference.age
+        ids, px, age, flow = reference.ids, reference.px, reference.age, np.zeros_like(reference.px)
         if self._reference_image is not None and len(ids):
             followed, good = self._follow_reference(self._reference_image, grey, predict, search)
-            ids, age = ids[good], age[good] + 1
+            ids, age, flow = ids[good], age[good] + 1, (followed - px)[good]
             aligned = self._templates.align(grey, ids, followed[good])
             good = aligned.good & self._is_inside(aligned.px)
-            ids, px, age, self._scale = ids[good], aligned.px[good], age[good], aligned.scale[good]
+            ids, px, age, flow = ids[good], aligned.px[good], age[good], flow[good]
+            self._scale = aligned.scale[good]
         fresh = self._new_corners(grey, px)
         ids = np.concatenate([ids, np.arange(self._next_id, self._next_id + len(fresh))])
         self._next_id += len(fresh)
-        return Tracks(ids, np.concatenate([px, fresh]), np.concatenate([age, np.zeros(len(fresh), np.int64)]), grey)
+        new = np.zeros_like(fresh)
+        age, flow = np.concatenate([age, new[:, 0].astype(np.int64)]), np.concatenate([flow, new])
+        return Tracks(ids, np.concatenate([px, fresh]), age, flow, grey)
 
     def accept(self, tracks: Tracks) -> None:
         """Makes the last tracked image the reference."""
@@ -142,7 +149,7 @@ class FeatureTracker:
         self._reference_image, self._candidate = None, None
         self._templates, self._scale = CornerTemplates(), np.zeros(0)
         no_ids = np.zeros(0, np.int64)
-        self._reference = Tracks(no_ids, np.zeros((0, 2)), no_ids, np.zeros((0, 0), np.uint8))
+        self._reference = Tracks(no_ids, np.zeros((0, 2)), no_ids, np.zeros((0, 2)), np.zeros((0, 0), np.uint8))
 
     def reset(self) -> None:
         """Drops all tracks; ids are not reused."""

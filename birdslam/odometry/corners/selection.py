@@ -15,7 +15,7 @@ from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.pose import Pose
 from birdslam.odometry.corners.below_plane import BelowPlaneConfig, BelowPlaneFilter
 from birdslam.odometry.corners.feature_tracks import Tracks
-from birdslam.odometry.corners.sliding_window import SlidingWindow, match_ids
+from birdslam.odometry.corners.sliding_window import SlidingWindow
 from birdslam.odometry.obstruction.fixed_corners import FixedCorners, FixedCornersConfig
 from birdslam.odometry.road.points import is_night, outside
 
@@ -57,15 +57,12 @@ class CornerSelector:
     ) -> Corners:
         """The corners of the current image; `travelled_m` is since the previous image, None if unknown."""
         static = outside(tracks.px, boxes_px, is_night(tracks.image))
-        ids, px = tracks.ids[static], tracks.px[static]
+        ids, px, age, flow = (a[static] for a in (tracks.ids, tracks.px, tracks.age, tracks.flow_px))
         self._fixed_corners.start(reference.ids, reference.px)
         fixed = self._fixed_corners.update(ids, px, ground, travelled_m)
         inlier = self._below_plane.inliers(ids)
-        ids, px, fixed = ids[inlier], px[inlier], fixed[inlier]
-        fixed &= self.obstructed
-        a, b = match_ids(reference.ids, ids)
-        a, b = a[~fixed[b]], b[~fixed[b]]
-        displacement: Floats = np.sqrt(((px[b] - reference.px[a]) ** 2).sum(axis=1))
+        ids, px, fixed = ids[inlier], px[inlier], fixed[inlier] & self.obstructed
+        displacement: Floats = np.linalg.norm(flow[inlier][(age[inlier] > 0) & ~fixed], axis=1)
         return Corners(ids, self._camera.to_xy(px), displacement, fixed)
 
     def reject_below_plane(self, window: SlidingWindow, pose: Pose, ground: GroundPlane) -> None:

@@ -55,10 +55,10 @@ def near_road_flow_px(
     near &= ~np.isin(reference.ids, fixed_ids)
     if near.sum() < _MIN_NEAR:
         return None
-    a, b = match_ids(reference.ids[near], tracks.ids)
-    if len(a) < _MIN_NEAR_SHARE * near.sum():
+    _, tracked = match_ids(reference.ids[near], tracks.ids)
+    if len(tracked) < _MIN_NEAR_SHARE * near.sum():
         return math.inf
-    return quantile(np.sqrt(((tracks.px[b] - reference.px[near][a]) ** 2).sum(axis=1)), 0.75)
+    return quantile(np.linalg.norm(tracks.flow_px[tracked], axis=1), 0.75)
 
 
 def is_stationary(
