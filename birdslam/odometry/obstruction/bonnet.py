@@ -38,7 +38,7 @@ class BonnetConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Thresholds of the bonnet detection."""
 
     step_m: Positive = 0.5  # distance between two images of the mean
-    images: Annotated[int, msgspec.Meta(ge=3)] = 6  # images of the mean; detection starts at half of them
+    images: Annotated[int, msgspec.Meta(ge=3)] = 6  # images of the mean; detection after each half of them
     edge_grey: Positive = 1.5  # minimum strength of a fixed edge in the mean, per pixel
     changes: Share = 0.4  # maximum mean deviation of an edge over its strength
     on_threshold: Share = 0.5  # minimum ratio of columns with an edge, for detection
@@ -74,7 +74,7 @@ class Bonnet:
             return False
         cv2.accumulateWeighted(np.abs(slope - self._mean), self._deviation, share)
         cv2.accumulateWeighted(slope, self._mean, share)
-        if 2 * self._images < cfg.images:
+        if self._images % (cfg.images // 2):  # half of the mean is old
             return False
         before, self.rows = self.rows, self._edge(top_px, *grey.shape)
         return before is None and self.rows is not None
