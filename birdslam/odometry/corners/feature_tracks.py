@@ -199,7 +199,9 @@ class FeatureTracker:
 
     def _is_inside(self, px: Floats) -> Bools:
         """(N,) whether corners (N, 2) are inside the image, with a margin."""
-        return ((px >= _MARGIN_PX) & (px < np.array([self.width_px, self.height_px]) - _MARGIN_PX)).all(axis=1)
+        size_px = np.array([self.width_px, self.height_px])
+        out: Bools = ((px >= _MARGIN_PX) & (px < size_px - _MARGIN_PX)).all(axis=1)
+        return out
 
     def _follow(
         self, then: NDArray[np.uint8], now: NDArray[np.uint8], px: Floats, start: Floats, levels: int

@@ -57,12 +57,13 @@ class CornerSelector:
     ) -> Corners:
         """The corners of the current image; `travelled_m` is since the previous image, None if unknown."""
         static = outside(tracks.px, boxes_px, is_night(tracks.image))
-        ids, px, age, flow = (a[static] for a in (tracks.ids, tracks.px, tracks.age, tracks.flow_px))
+        ids, px = tracks.ids[static], tracks.px[static]
         self._fixed_corners.start(reference.ids, reference.px)
         fixed = self._fixed_corners.update(ids, px, ground, travelled_m)
         inlier = self._below_plane.inliers(ids)
         ids, px, fixed = ids[inlier], px[inlier], fixed[inlier] & self.obstructed
-        displacement: Floats = np.linalg.norm(flow[inlier][(age[inlier] > 0) & ~fixed], axis=1)
+        old = (tracks.age[static][inlier] > 0) & ~fixed
+        displacement: Floats = np.linalg.norm(tracks.flow_px[static][inlier][old], axis=1)
         return Corners(ids, self._camera.to_xy(px), displacement, fixed)
 
     def reject_below_plane(self, window: SlidingWindow, pose: Pose, ground: GroundPlane) -> None:
