@@ -199,8 +199,9 @@ class FeatureTracker:
 
     def _is_inside(self, px: Floats) -> Bools:
         """(N,) whether corners (N, 2) are inside the image, with a margin."""
-        size_px = np.array([self.width_px, self.height_px])
-        out: Bools = ((px >= _MARGIN_PX) & (px < size_px - _MARGIN_PX)).all(axis=1)
+        u, v = px.T
+        beside, below = self.width_px - _MARGIN_PX, self.height_px - _MARGIN_PX
+        out: Bools = (u >= _MARGIN_PX) & (v >= _MARGIN_PX) & (u < beside) & (v < below)
         return out
 
     def _follow(
