@@ -12,6 +12,7 @@ from pathlib import Path
 
 import geojson
 import gpxpy
+import msgspec
 import numpy as np
 import pymap3d
 import pytest
@@ -99,6 +100,20 @@ def test_fixes_with_15_m_error_for_10_s_are_rejected() -> None:
     wrong = tied(true, nodes, links, fixes_of(true, 1.5, off))
     assert wrong.earth.outliers >= len(off) // 2
     assert errors_m(wrong, nodes, true).max() < errors_m(right, nodes, true).max() + 1.0
+
+
+@pytest.mark.parametrize("length_m", [80.0, 200.0])
+@pytest.mark.parametrize("off_m", [100.0, 1e3, 1e5])
+def test_a_short_drive_with_a_far_outlier_keeps_its_place(length_m: float, off_m: float) -> None:
+    """A far outlier is counted, and moves neither the fit of all fixes nor their delay."""
+    true, nodes, links = way(length_m, seed=1)
+    fixes = fixes_of(true, 5.0)
+    right = tied(true, nodes, links, fixes)
+    far = msgspec.structs.replace(fixes[2], latitude_deg=fixes[2].latitude_deg + off_m / 111e3)
+    wrong = tied(true, nodes, links, [*fixes[:2], far, *fixes[3:]])
+    assert wrong.earth.fixes == right.earth.fixes
+    assert wrong.earth.outliers == right.earth.outliers + 1
+    assert errors_m(wrong, nodes, true).max() < errors_m(right, nodes, true).max() + 3.0
 
 
 def test_invalid_fixes_are_refused() -> None:

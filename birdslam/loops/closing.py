@@ -80,7 +80,11 @@ def close_loops(
 
 
 def inliers(keyframes: Sequence[Placed], links: Sequence[Link], fixes: Sequence[PlaceFactor]) -> Bools:
-    """Returns (N,) whether each fix is consistent with the others and odometry."""
+    """Returns (N,) whether each fix is consistent with the others and odometry.
+
+    A fix farther from its keyframe than the drive extends is rejected at once: graduated non-convexity starts from the
+    fit of all fixes, which a single one of these would ruin.
+    """
     import gtsam
 
     graph, start = _graph(keyframes, links, LOOSE_SIGMA)
@@ -89,11 +93,21 @@ def inliers(keyframes: Sequence[Placed], links: Sequence[Link], fixes: Sequence[
         graph.add(_place_factor(fix, fix.sigma_m, start))
     params = gtsam.GncLMParams()
     params.setKnownInliers(list(range(size - sum(link.loop for link in links))))
+    params.setKnownOutliers((size + np.flatnonzero(_far(keyframes, fixes))).tolist())
     solver = gtsam.GncLMOptimizer(graph, start, params)
     solver.setInlierCostThresholds(GNC_COST)
     solver.optimize()
     out: Bools = np.array(solver.getWeights())[size:] > 0.5
     return out
+
+
+def _far(keyframes: Sequence[Placed], fixes: Sequence[PlaceFactor]) -> Bools:
+    """Returns (N,) whether each fix is farther from its keyframe than the keyframes extend."""
+    at = {keyframe.number: (keyframe.T_map_keyframe.x_m, keyframe.T_map_keyframe.y_m) for keyframe in keyframes}
+    extent_m = np.linalg.norm(np.ptp(np.array(list(at.values())), axis=0))
+    apart_m = np.array([math.dist(fix.xy_m, at[fix.number]) for fix in fixes])
+    far: Bools = apart_m > extent_m + math.sqrt(2.0 * GNC_COST) * np.array([fix.sigma_m for fix in fixes])
+    return far
 
 
 def _graph(

@@ -253,7 +253,7 @@ def _delay(seconds: Floats, xy: Floats, times: Floats, enu: Floats, sigma: Float
             if inside.sum() > MIN_FIXES:
                 here = np.column_stack([np.interp(at[inside], seconds, column) for column in xy.T])
                 chi2 = fit(here, enu[window][inside], sigma[window][inside], WINDOW_ITERATIONS)[2]
-                cost += float(np.log1p(chi2).sum())
+                cost += float(np.log1p(np.minimum(chi2, GATE**2)).sum())  # at most that of a fix outside the drive
         costs.append(cost)
     weight = np.exp(min(costs) - np.array(costs))
     mean_s = round(float(weight @ DELAYS_S / weight.sum()), 3)
