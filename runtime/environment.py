@@ -7,6 +7,7 @@ Imports nothing, since numpy's libraries read the environment when they are load
 ENVIRONMENT = {
     **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1"),
     "OPENCV_FFMPEG_LOGLEVEL": "-8",  # FFmpeg logs every damaged block; a status reports the frame
+    "OPENCV_IO_MAX_IMAGE_PIXELS": str(1 << 26),  # a damaged head may state 32,000 x 32,000; 8K has half of this
     "ORT_DISABLE_TELEMETRY": "1",
     # glibc keeps the memory of a frame's images for the next frame, which avoids page faults (docs/deployment.md)
     "MALLOC_MMAP_THRESHOLD_": str(32 << 20),  # its maximum

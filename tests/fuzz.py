@@ -2,21 +2,22 @@
 
 Targets are the messages of the bus, what a subscriber, a planner and the optimizer make of them, references to frames
 in shared memory, and the files that a user gives: configuration, camera, calibration of another project, boxes,
-manifest, speeds, fixes. Whatever comes in is either accepted, and then is a whole valid record that can be sent on, or
-refused with the one exception that the target is there to raise. Anything else ends the run with status 1 and the case
-that did it. The same seed gives the same cases.
+manifest, speeds, fixes, trajectories, bags. Whatever comes in is either accepted, and then is a whole valid record that
+can be sent on, or refused with the one exception that the target is there to raise. Anything else ends the run with
+status 1 and the case that did it. The same seed gives the same cases.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import resource
 import sys
 import tempfile
 import time
 import tomllib
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
@@ -32,7 +33,7 @@ from birdslam.calibration.camera_files import read_intrinsics
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.pose_graph import PoseGraph
-from birdslam.loops.gnss.earth import Earth
+from birdslam.loops.gnss.earth import Earth, is_on_earth
 from birdslam.loops.gnss.files import GnssError, read_fixes
 from birdslam.loops.keyframe import Fixed, Keyframe, LinePiece, Link
 from birdslam.loops.map_file import HEAD, MAGIC, VERSION, MapError, decode_map, encode_map
@@ -41,6 +42,8 @@ from birdslam.perception.manifest import Manifest, ModelError
 from birdslam.perception.manifest_file import read_manifest, shipped_manifests
 from birdslam.runtime.client import reading_of
 from birdslam.runtime.configuration import Configuration, ConfigurationError, dump, load
+from birdslam.runtime.environment import ENVIRONMENT
+from birdslam.runtime.maps.film_gnss import fixes_of_tags
 from birdslam.runtime.topology import TOPICS, key_of
 from birdslam.runtime.transport.bus import Subscriber
 from birdslam.runtime.transport.ring import FrameError, FrameReader, FrameRing
@@ -49,15 +52,17 @@ from birdslam.slam import SlamConfig
 from birdslam.sources.camera_file import load_camera
 from birdslam.sources.detection_file import read_detection_file
 from birdslam.sources.kitti import read_image, read_projection, read_times
+from birdslam.sources.odometry_file import read_odometry
+from birdslam.sources.opening import open_recording
 from birdslam.sources.recording import DatasetError
-from birdslam.sources.speed_file import read_speeds
+from birdslam.sources.speed_file import read_speed_curve, read_speeds
 from birdslam.types import INVALIDATING, Attitude, FrameRef, LineColour, LineKind, Measurements
 from tests.mutations import Chance, mutated, mutated_text, with_other_fields
+from tests.ros_bags import Written, image, write_bag
 from tests.test_camera_files import FILES as OTHER_CAMERAS
 from tests.test_wire import BY_NAME, EXAMPLES
 
 ROOT = Path(__file__).resolve().parent.parent
-SPEEDS = "# t v\n0 12.5\n0.02, 12.6, 0.05\n0.04, 12.7, , -0.01, 0.002\n0.06, nan\n"
 FIXES = [
     "time_s,latitude_deg,longitude_deg,speed_mps\n0.5,51.0,-114.1,12.5\n1.5,51.1,-114.2,\n",
     "$GPRMC,123519,A,4807.038,N,01131.000,E,022.4,084.4,230394,003.1,W*6A\n",
@@ -65,6 +70,23 @@ FIXES = [
     "$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\n",
     "1\n00:00:01,000 --> 00:00:02,000\n[latitude: 48.1] [longitude: 11.5]\n\n2\n00:00:02,500 --> 0\nGPS(11.5,48.1,9)\n",
     "lat,lon,unix_s,speed_kmh\n48.1,11.5,1600000000.5,12\n48.1,11.6,1600000001.5,\n",
+]
+SPEEDS = [
+    "# t v\n0 12.5\n0.02, 12.6, 0.05\n0.04, 12.7, , -0.01, 0.002\n0.06, nan\n",
+    "t_s,speed_kmh,sigma_mps,yaw_rate_radps,note\n0,45,0.1,0.01,a\n0.1,46,,,b\n",
+    "time,lat,lon\n0,48.1,11.5\n1,48.1001,11.5\n2,48.1002,11.5\n",
+    "time,lat,lon,speed_mph\n0,48.1,11.5,20\n1,48.1001,11.5,21\n2,48.1002,11.5,\n",
+    *FIXES[1:4],
+]
+TRAJECTORIES = [
+    "# t x y z qx qy qz qw\n0 0 0 0 0 0 0 1\n0.1 1 0 0 0 0 0 1\n0.2 2 0 0 0 0 0.1 0.99\n",
+    "1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 0.1 0 1 0 0 0 0 1 1\n",
+]
+FILM_TAGS = [
+    '[{"SourceFile": "a.mp4", "Doc1:GPSLatitude": 48.1, "Doc1:GPSLongitude": 11.5, "Doc1:GPSDateTime":'
+    ' "2020:01:31 12:00:00.5Z", "Doc2:GPSLatitude": 48.2, "Doc2:GPSLongitude": 11.5, "Doc2:SampleTime": 1.5}]',
+    '[{"Doc1:SampleTime": 0.5, "Doc1:Text": "[latitude: 48.1] [longitude: 11.5]", "Doc2:SampleTime": 2.5, "Doc2:Text":'
+    ' "GPS(11.5,48.2,9)"}]',
 ]
 BOXES = [
     "1,7,10.5,20,30,40,0.9,1,0.8\n2,-1,10,20,30,40,-1,-1,-1,-1\n",
@@ -251,7 +273,8 @@ def files(goods: list[str], read: Callable[[Path], object], refusal: type[Except
             path.write_bytes(mutated_text(chance, chance.choice(goods)))
             try:
                 read(path)
-            except refusal:
+            except refusal as error:
+                assert path.name in str(error) or refusal is ConfigurationError  # noqa: PT017 # of a file it names
                 return False
             return True
 
@@ -286,6 +309,25 @@ def _read_other_camera(path: Path) -> None:
     assert min(lens.fx_px, lens.fy_px) > 0.0
 
 
+def _read_speed_curve(path: Path) -> None:
+    assert (np.diff(read_speed_curve(path)[:, 0]) > 0.0).all()
+
+
+def _read_odometry(path: Path) -> None:
+    trajectory = read_odometry(path)
+    assert np.isfinite(trajectory.poses).all()
+    assert trajectory.t_ns is None or (np.diff(trajectory.t_ns) > 0).all()
+
+
+def _read_film_tags(path: Path) -> None:
+    fixes = fixes_of_tags(path.read_bytes())
+    if not fixes:
+        raise GnssError(f"{path}: has no fix")
+    for fix in fixes:
+        assert is_on_earth(fix.latitude_deg, fix.longitude_deg)
+        assert isinstance(fix.t_ns, int)
+
+
 def _read_boxes(path: Path) -> None:
     for detections in read_detection_file(path).values():
         assert np.isfinite(detections.boxes_px).all()
@@ -301,6 +343,33 @@ def _read_recording(path: Path) -> None:
         assert np.isfinite(read_projection(path, "P0")).all()
     else:
         assert all(later > earlier for earlier, later in pairwise(read_times(path)))
+
+
+def bags(folder: Path) -> Target:
+    """Mutated bags of ROS 1 and ROS 2: frames of increasing times, or DatasetError with the file."""
+    images = [image(np.zeros((6, 8), np.uint8), 10**9 * (number + 1)) for number in range(3)]
+    messages: list[Written] = [("/c/image", number, one) for number, one in enumerate(images)]
+    goods = [
+        write_bag(folder / "good.bag", messages, "ros1"),
+        *write_bag(folder / "good", messages, "mcap").glob("*.mcap"),
+        *write_bag(folder / "good3", messages, "sqlite3").glob("*.db3"),
+    ]
+    camera = Camera(8, 6, 5.0, 5.0, 4.0, 3.0, 1.4)
+
+    def target(chance: Chance) -> bool:
+        good = chance.choice(goods)
+        path = folder / f"file{good.suffix}"
+        path.write_bytes(mutated(chance, data := good.read_bytes(), data))
+        try:
+            frames = list(open_recording(f"rosbag:{path}", camera).frames())
+        except DatasetError as error:
+            assert path.name in str(error)  # noqa: PT017
+            return False
+        assert all(later.t_source_ns > earlier.t_source_ns for earlier, later in pairwise(frames))
+        assert all(frame.error for frame in frames if frame.image is None)
+        return True
+
+    return target
 
 
 @contextmanager
@@ -381,34 +450,36 @@ def _cameras() -> list[str]:
     return ["".join(f"{key} = {value}\n" for key, value in camera.items())]
 
 
+def readers() -> Iterator[tuple[str, float, list[str], Callable[[Path], object], type[Exception]]]:
+    """Name, share of all cases, valid files, what reads them, and how it refuses one."""
+    manifests = [path.read_text() for path in shipped_manifests().values()]
+    times = "".join(f"{0.1 * i:e}\n" for i in range(8))
+    projections = "".join(f"P{i}: 700 0 300 {-i} 0 700 100 0 0 0 1 0\n" for i in range(2))
+    others = [text for _, text in OTHER_CAMERAS.values()]
+    yield "GNSS fixes", 0.01, FIXES, _read_fixes, GnssError
+    yield "calibrations of others", 0.01, others, _read_other_camera, DatasetError
+    yield "boxes of others", 0.02, BOXES, _read_boxes, DatasetError
+    yield "speed files", 0.01, SPEEDS, _read_speeds, DatasetError
+    yield "speed curves", 0.005, SPEEDS[:2], _read_speed_curve, DatasetError
+    yield "trajectories", 0.005, TRAJECTORIES, _read_odometry, DatasetError
+    yield "GNSS tags of films", 0.005, FILM_TAGS, _read_film_tags, GnssError
+    yield "recordings' text files", 0.01, [times, projections], _read_recording, DatasetError
+    yield "configuration files", 0.02, _configurations(), _read_configuration, ConfigurationError
+    yield "camera files", 0.02, _cameras(), _read_camera, DatasetError
+    yield "manifest files", 0.02, manifests, _read_manifest, ModelError
+
+
 def targets(folder: Path) -> Iterator[tuple[str, float, Callable[[], object]]]:
     """Name, share of all cases, and what makes the target."""
-    yield "bytes of messages", 0.525, bytes_of_messages
+    yield "bytes of messages", 0.505, bytes_of_messages
     yield "fields of messages", 0.17, fields_of_messages
     yield "optimizer", 0.02, optimizer
     yield "subscribers and planner", 0.13, subscribers
     yield "references to frames", 0.02, references
-    manifests = [path.read_text() for path in shipped_manifests().values()]
     yield "images", 0.005, lambda: images(folder)
     yield "maps", 0.01, maps
-    times = "".join(f"{0.1 * i:e}\n" for i in range(8))
-    projections = "".join(f"P{i}: 700 0 300 {-i} 0 700 100 0 0 0 1 0\n" for i in range(2))
-    for name, share, goods, read, refusal in (
-        ("GNSS fixes", 0.01, FIXES, _read_fixes, GnssError),
-        (
-            "calibrations of others",
-            0.01,
-            [text for _, text in OTHER_CAMERAS.values()],
-            _read_other_camera,
-            DatasetError,
-        ),
-        ("boxes of others", 0.02, BOXES, _read_boxes, DatasetError),
-        ("speed files", 0.01, [SPEEDS], _read_speeds, DatasetError),
-        ("recordings' text files", 0.01, [times, projections], _read_recording, DatasetError),
-        ("configuration files", 0.02, _configurations(), _read_configuration, ConfigurationError),
-        ("camera files", 0.02, _cameras(), _read_camera, DatasetError),
-        ("manifest files", 0.02, manifests, _read_manifest, ModelError),
-    ):
+    yield "bags", 0.005, lambda: bags(folder)
+    for name, share, goods, read, refusal in readers():
         make = files(goods, read, refusal)
         yield name, share, lambda make=make: make(folder)  # type: ignore[misc]
 
@@ -421,23 +492,28 @@ class Count:
     cases: int
     let_in: int
     seconds: float
+    slowest_s: float
 
 
-def run(cases: int, seed: int) -> Iterator[Count]:
-    """All targets; raises what a target should not have raised, with the case's number in a note."""
+def run(cases: int, seed: int, only: Container[str] | None = None) -> Iterator[Count]:
+    """All targets, or `only` some; raises what a target should not have raised, with the case's number in a note."""
     with tempfile.TemporaryDirectory() as folder:
-        for name, share, make in targets(Path(folder)):
+        chosen = [target for target in targets(Path(folder)) if only is None or target[0] in only]
+        shares = sum(share for _, share, _ in chosen)
+        for name, share, make in chosen:
             chance, begun_s, let_in = Chance(f"{seed} {name}"), time.monotonic(), 0
-            number = round(cases * share)
+            number, slowest_s, last_s = round(cases * share / shares), 0.0, begun_s
             made = make()
             with made if hasattr(made, "__enter__") else _open(made) as target:  # type: ignore[attr-defined]
                 for case in range(number):
                     try:
                         let_in += target(chance)
+                        now_s = time.monotonic()
+                        slowest_s, last_s = max(slowest_s, now_s - last_s), now_s
                     except Exception as error:
                         error.add_note(f"case {case} of {name!r}, seed {seed}")
                         raise
-            yield Count(name, number, let_in, time.monotonic() - begun_s)
+            yield Count(name, number, let_in, time.monotonic() - begun_s, slowest_s)
 
 
 @contextmanager
@@ -450,15 +526,20 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="tests.fuzz", description="Mutated bytes at every target.")
     parser.add_argument("--cases", type=int, default=1_000_000, metavar="N")
     parser.add_argument("--seed", type=int, default=6, metavar="N")
+    parser.add_argument("--only", action="append", metavar="TARGET", help="one of the targets; repeatable")
     options = parser.parse_args(arguments)
     total = 0
-    for count in run(options.cases, options.seed):
+    for count in run(options.cases, options.seed, options.only):
         total += count.cases
         let_in = f"{count.cases - count.let_in:>9} refused  {count.let_in:>9} valid"
-        print(f"{count.name:26}{count.cases:>9} cases  {let_in}  {count.seconds:6.1f} s", flush=True)
-    print(f"{'all':26}{total:>9} cases, none did harm (seed {options.seed})")
+        times = f"{count.seconds:6.1f} s, slowest {1e3 * count.slowest_s:4.0f} ms"
+        print(f"{count.name:26}{count.cases:>9} cases  {let_in}  {times}", flush=True)
+    memory_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10
+    print(f"{'all':26}{total:>9} cases, none did harm (seed {options.seed}), at most {memory_mib} MiB")
     return 0
 
 
 if __name__ == "__main__":
+    if not ENVIRONMENT.items() <= os.environ.items():  # OpenCV has read it when it was imported
+        os.execve(sys.executable, [sys.executable, "-m", "tests.fuzz", *sys.argv[1:]], {**os.environ, **ENVIRONMENT})
     sys.exit(main())

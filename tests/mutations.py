@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import re
 
 Chance = random.Random
 
@@ -23,6 +24,38 @@ SPECIAL_TOKENS = (
         '"x" = 1',
         "= =",
         "#",
+    ),
+)
+NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:[eE][+-]?\d+)?")
+SPECIAL_NUMBERS = (
+    *(
+        "nan",
+        "-nan",
+        "inf",
+        "-inf",
+        "1e308",
+        "-1e308",
+        "1e400",
+        "1e-320",
+        "-0",
+        "0",
+        "-1",
+        "1e9",
+        "1e19",
+        "181",
+        "90.1",
+    ),
+    *(
+        "9" * 20,
+        "9" * 400,
+        "1_0",
+        "0x1",
+        "1e",
+        "1,5",
+        "",
+        "1.7976931348623157e308",
+        "2147483648",
+        "-9223372036854775809",
     ),
 )
 
@@ -66,9 +99,12 @@ def with_other_fields(chance: Chance, plain: object) -> object:
 
 
 def mutated_text(chance: Chance, good: str) -> bytes:
-    """A file of lines KEY = VALUE with other values, other keys, lost, doubled and foreign lines, or foreign bytes."""
-    if chance.random() < 0.3:
+    """A text file with other and swapped numbers, or foreign bytes, or lost, doubled and foreign lines and values."""
+    kind = chance.random()
+    if kind < 0.3:
         return mutated(chance, good.encode(), good.encode())
+    if kind < 0.6:
+        return with_other_numbers(chance, good).encode()
     lines = good.splitlines()
     for _ in range(chance.randint(1, 3)):
         place = chance.randrange(len(lines))
@@ -85,3 +121,12 @@ def mutated_text(chance: Chance, good: str) -> bytes:
                 place, f"{chance.choice(('x', 'every', 'camera', 'vehicle'))} = {chance.choice(SPECIAL_TOKENS)}"
             )
     return "\n".join(lines).encode()
+
+
+def with_other_numbers(chance: Chance, good: str) -> str:
+    """Replaces some numbers of a text by special ones, or by other numbers of the text."""
+    numbers = list(NUMBER.finditer(good))
+    for found in sorted(chance.sample(numbers, min(len(numbers), chance.randint(1, 3))), key=lambda one: -one.start()):
+        other = chance.choice(SPECIAL_NUMBERS) if chance.random() < 0.7 else chance.choice(numbers)[0]
+        good = good[: found.start()] + other + good[found.end() :]
+    return good

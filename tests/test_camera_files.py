@@ -125,6 +125,12 @@ def test_an_undistorted_camera_of_kitti(tmp_path: Path) -> None:
     assert (lens.fx_px, lens.cx_px, lens.distortion, lens.width_px) == (721.5, 609.5, (), None)
 
 
+def test_a_camera_of_kitti_raw_has_the_size_of_its_rectified_images(tmp_path: Path) -> None:
+    text = "S_00: 1392 512\nS_rect_00: 1.242e+03 3.75e+02\nP_rect_00: 721.5 0 609.5 0 0 721.5 172.8 0 0 0 1 0\n"
+    lens = read_intrinsics(written(tmp_path, "calib_cam_to_cam.txt", text))
+    assert (lens.fx_px, lens.width_px, lens.height_px) == (721.5, 1242, 375)
+
+
 def test_an_undistorted_camera_of_nuscenes(tmp_path: Path) -> None:
     lens = read_intrinsics(written(tmp_path, "calibrated_sensor.json", NUSCENES))
     assert (lens.fx_px, lens.fy_px, lens.distortion, lens.width_px) == (438.5, 437.25, (), None)

@@ -26,6 +26,7 @@ from birdslam.sources.films.interlaced import is_undecoded, may_be_interlaced
 from birdslam.sources.films.video import VideoRecording
 from birdslam.sources.opening import open_recording
 from birdslam.sources.recording import DatasetError, RecordedFrame
+from birdslam.sources.schemes import RECORDED, uri_of
 
 av = pytest.importorskip("av", reason="films are written by PyAV (pip install av)")
 
@@ -416,5 +417,6 @@ def test_films_of_a_stationary_camera_are_not_cut(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("codec", "suffix"), [("libx264", "h264"), ("libx265", "hevc")])
 def test_a_raw_stream_is_refused_with_the_remedy(tmp_path: Path, codec: str, suffix: str) -> None:
     path = film(tmp_path / f"raw.{suffix}", range(0, 1000, 33), codec=codec)
+    assert uri_of(str(path), RECORDED) == f"video:{path}"
     with pytest.raises(DatasetError, match="ffmpeg -framerate"):
         frames(path)

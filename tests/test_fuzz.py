@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import re
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 from birdslam.perception import ModelError, ModelSpec, load_network
 from birdslam.perception.manifest_file import read_manifest, shipped_manifests
 from tests import fuzz
+from tests.mutations import NUMBER
 
 ROOT = Path(__file__).resolve().parent.parent
 CASES, SEED = 5_000, 6
@@ -24,6 +26,19 @@ def test_every_target_holds() -> None:
     assert abs(sum(count.cases for count in counts.values()) - CASES) < len(counts)
     for count in counts.values():  # a target that lets all or nothing in was not tried
         assert 0 < count.let_in < count.cases, count
+
+
+@pytest.mark.parametrize("name", [name for name, *_ in fuzz.readers()])
+def test_every_number_of_a_file_may_be_any_other(name: str, tmp_path: Path) -> None:
+    """Each number of each valid file, replaced by each of a few: a whole record, or the reader's own exception."""
+    goods, read, refusal = next(rest for found, _, *rest in fuzz.readers() if found == name)
+    path = tmp_path / "file.toml"
+    for good in goods:
+        for number in NUMBER.finditer(good):
+            for other in ("nan", "inf", "1e308", "9" * 400, "-1", "181"):
+                path.write_text(good[: number.start()] + other + good[number.end() :])
+                with contextlib.suppress(refusal):
+                    read(path)
 
 
 def test_the_same_seed_gives_the_same_cases() -> None:

@@ -9,10 +9,11 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
-import cv2
 import numpy as np
 import yaml
 
@@ -23,6 +24,7 @@ from birdslam.sources.recording import DatasetError
 KITTI_KEYS = ("P0", "P2", "P_rect_00", "P_rect_02")
 DISTORTIONS = ("plumb_bob", "rational_polynomial", "radtan", "thin_prism", "equidistant", "")  # of ROS; OpenCV: none
 FISHEYES = ("equidistant", "kannala_brandt", "KannalaBrandt8")
+MAX_SIDE_PX = 1 << 16  # of an image
 COEFFICIENTS = (4, 5, 8, 12, 14)  # OpenCV's models of distortion
 # Parameters of COLMAP's models after the focal lengths and the principal point, in the order of OpenCV's coefficients
 COLMAP: dict[str, tuple[int, tuple[int | None, ...], bool]] = {  # name: focal lengths, coefficients, fisheye
@@ -56,7 +58,7 @@ def read_intrinsics(path: Path, key: str | None = None) -> Intrinsics:
     text = _text(path)
     name = _recognized(text)
     if name == "KITTI" or key:
-        return _kitti(path, key)
+        return _kitti(path, text, key)
     if name == "COLMAP":
         return _colmap(path, text)
     if name == "OpenCV":
@@ -116,24 +118,26 @@ def _tree(path: Path, text: str) -> Any:
 
 
 def _opencv_storage(path: Path, text: str) -> dict[str, Any]:
-    """Reads an XML file of cv2.FileStorage like `_tree` reads YAML."""
+    """Reads an XML file of cv2.FileStorage like `_tree` reads YAML; OpenCV's own parser overflows on long numbers."""
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise DatasetError(f"{path}: XML with a DOCTYPE is not supported")
     try:
-        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-        nodes = {name: storage.getNode(name) for name in storage.root().keys()}  # noqa: SIM118
-        tree: dict[str, Any] = {}
-        for name, node in nodes.items():
-            if node.isInt() or node.isReal():
-                tree[name] = int(node.real()) if node.isInt() else node.real()
-            elif node.isString():
-                tree[name] = node.string()
-            elif node.isMap() and (matrix := node.mat()) is not None:
-                tree[name] = matrix.ravel().tolist()
-        return tree
-    except (cv2.error, SystemError) as error:
-        raise DatasetError(f"{path}: not an OpenCV storage: {' '.join(str(error).split())[:200]}") from None
+        root = ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError, RecursionError) as error:
+        raise DatasetError(f"{path}: not an OpenCV storage: {error}") from None
+    matrices = ((node, node.findtext("data")) for node in root)
+    return {node.tag: _number(node.text or "") if data is None else data.split() for node, data in matrices}
 
 
-def _kitti(path: Path, key: str | None) -> Intrinsics:
+def _number(text: str) -> int | float | str:
+    for kind in (int, float):
+        with suppress(ValueError):
+            return kind(text)
+    return text.strip()
+
+
+def _kitti(path: Path, text: str, key: str | None) -> Intrinsics:
+    """From a projection matrix of a rectified camera; KITTI raw states the image size beside it."""
     reason = ""
     for name in (key,) if key else KITTI_KEYS:
         try:
@@ -143,8 +147,17 @@ def _kitti(path: Path, key: str | None) -> Intrinsics:
                 raise
             reason = str(error)
             continue
+        sizes = {line.partition(":")[0]: line.split()[1:] for line in text.splitlines() if line.startswith("S_rect")}
+        size = _numbers(path, sizes, (name.replace("P_", "S_"),)) or ()
+        width, height = (_side(path, side) for side in (size if len(size) == 2 else (None, None)))
         return Intrinsics(
-            fx_px=P[0, 0], fy_px=P[1, 1], cx_px=P[0, 2], cy_px=P[1, 2], source=f"{path} ({name}, rectified)"
+            fx_px=P[0, 0],
+            fy_px=P[1, 1],
+            cx_px=P[0, 2],
+            cy_px=P[1, 2],
+            width_px=width,
+            height_px=height,
+            source=f"{path} ({name}, rectified)",
         )
     raise DatasetError(reason if key else f"{path}: has none of {', '.join(KITTI_KEYS)}")
 
@@ -174,8 +187,8 @@ def _of_matrices(path: Path, tree: Mapping[str, Any]) -> Intrinsics:
         (K[0], K[4], K[2], K[5]),
         distortion,
         fisheye,
-        _size(path, tree, ("image_width", "width", "image_Width"), width),
-        _size(path, tree, ("image_height", "height", "image_Height"), height),
+        _first(tree, ("image_width", "width", "image_Width"), width),
+        _first(tree, ("image_height", "height", "image_Height"), height),
     )
 
 
@@ -197,7 +210,7 @@ def _kalibr(path: Path, tree: Mapping[str, Any]) -> Intrinsics:
         raise DatasetError(f"{path}: distortion_model {model} is not supported (only radtan, equidistant)")
     distortion = _numbers(path, camera, ("distortion_coeffs",)) or []
     size = _numbers(path, camera, ("resolution",))
-    width, height = (int(size[0]), int(size[1])) if size and len(size) == 2 else (None, None)
+    width, height = size if size and len(size) == 2 else (None, None)
     return _intrinsics(path, focal, distortion, model == "equidistant", width, height)
 
 
@@ -221,7 +234,7 @@ def _orb_slam(path: Path, tree: Mapping[str, Any]) -> Intrinsics:
     distortion = [value or 0.0 for value in coefficients]
     if not fisheye and coefficients[4] is None:
         distortion = distortion[:4]
-    width, height = (_size(path, tree, (f"Camera.{side}",), None) for side in ("width", "height"))
+    width, height = (tree.get(f"Camera.{side}") for side in ("width", "height"))
     known = [value for value in focal if value is not None]
     return _intrinsics(path, known, distortion, fisheye, width, height)
 
@@ -240,12 +253,12 @@ def _colmap(path: Path, text: str) -> Intrinsics:
     except ValueError:
         raise DatasetError(f"{path}: a camera's line contains a value that is not a number") from None
     expected = focals + 2 + sum(k is not None for k in order)
-    if len(parameters) != expected or not np.isfinite(parameters).all() or min(width, height) < 1.0:
+    if len(parameters) != expected or not np.isfinite(parameters).all():
         raise DatasetError(f"{path}: {model} has {len(parameters)} parameters, not {expected}")
     fx, fy = parameters[0], parameters[focals - 1]
     cx, cy, *rest = parameters[focals:]
     distortion = [0.0 if k is None else rest[k] for k in order]
-    return _intrinsics(path, (fx, fy, cx - 0.5, cy - 0.5), distortion, fisheye, int(width), int(height))
+    return _intrinsics(path, (fx, fy, cx - 0.5, cy - 0.5), distortion, fisheye, width, height)
 
 
 def _nuscenes(path: Path, tree: Any) -> Intrinsics:
@@ -269,8 +282,8 @@ def _intrinsics(
     focal_px: Sequence[float],
     distortion: Sequence[float],
     fisheye: bool,
-    width_px: int | None,
-    height_px: int | None,
+    width_px: object,
+    height_px: object,
 ) -> Intrinsics:
     """`focal_px` is fx, fy, cx, cy. An equidistant lens distorts also with zero coefficients."""
     if fisheye and len(distortion) > 4:
@@ -288,8 +301,8 @@ def _intrinsics(
         cy_px=cy,
         distortion=tuple(map(float, distortion)) if any(distortion) or fisheye else (),
         fisheye=fisheye,
-        width_px=width_px,
-        height_px=height_px,
+        width_px=_side(path, width_px),
+        height_px=_side(path, height_px),
         source=str(path),
     )
 
@@ -302,7 +315,7 @@ def _numbers(path: Path, tree: Mapping[str, Any], keys: Iterable[str]) -> list[f
         data = value.get("data") if isinstance(value, dict) else value
         try:
             numbers = np.array(data, dtype=np.float64).ravel()
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise DatasetError(f"{path}: {key} contains a value that is not a number") from None
         if not np.isfinite(numbers).all() or not len(numbers):
             raise DatasetError(f"{path}: {key} has numbers that are not finite")
@@ -311,10 +324,14 @@ def _numbers(path: Path, tree: Mapping[str, Any], keys: Iterable[str]) -> list[f
     return None
 
 
-def _size(path: Path, tree: Mapping[str, Any], keys: Iterable[str], default: object) -> int | None:
-    value = next((tree[key] for key in keys if tree.get(key) is not None), default)
+def _first(tree: Mapping[str, Any], keys: Iterable[str], default: object) -> object:
+    return next((tree[key] for key in keys if tree.get(key) is not None), default)
+
+
+def _side(path: Path, value: object) -> int | None:
+    """A side of the image in px, which may be missing. Raises DatasetError."""
     if value is None:
         return None
-    if not isinstance(value, int) or value < 1:
-        raise DatasetError(f"{path}: invalid image size {value!r}")
-    return value
+    if not isinstance(value, int | float) or not 1.0 <= value <= MAX_SIDE_PX or value != int(value):
+        raise DatasetError(f"{path}: invalid image size {str(value)[:40]!r}")
+    return int(value)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import ExitStack
 from functools import cache
@@ -13,6 +14,8 @@ import msgspec
 from birdslam.types import NS_PER_S
 
 NEEDS_EXTRA = "ROS bags need the library rosbags: pip install 'birdslam[ros]'"
+
+_NAMED = re.compile(r"'(\w+/msg/\w+)'")  # types of fields in rosbags' definitions
 
 
 class BagError(ValueError):
@@ -49,14 +52,17 @@ class Bag:
             raise BagError(f"{path}: no such file or directory")
         self._stack = ExitStack()
         try:
-            reader = AnyReader([path], default_typestore=_types_of_humble())
+            reader = AnyReader([path], default_typestore=_types(is_ros2=True))
             self._reader = self._stack.enter_context(reader)
         except Exception as error:  # storages, YAML and compression raise many types for a damaged file
             raise BagError(f"{path}: is not a readable ROS bag: {_reason(error)}") from None
         self.types: dict[str, str] = {}  # topic -> message type, as in "sensor_msgs/Image"
         self.counts: dict[str, int] = {}  # topic -> messages
         for connection in sorted(self._reader.connections, key=lambda one: one.topic):
-            self.types[connection.topic] = connection.msgtype.replace("/msg/", "/")
+            kind = connection.msgtype.replace("/msg/", "/")
+            usual = _types(self._reader.is2).fielddefs
+            is_usual = _has_usual_fields(connection.msgtype, self._reader.typestore.fielddefs, usual)
+            self.types[connection.topic] = kind if is_usual else f"{kind} with other fields"
             self.counts[connection.topic] = self.counts.get(connection.topic, 0) + connection.msgcount
 
     def __enter__(self) -> Self:
@@ -107,11 +113,23 @@ def stamp_ns(content: Any) -> int:
 
 
 @cache
-def _types_of_humble() -> Any:
-    """Types for bags of ROS 2 before Iron, which do not carry them; the types read here are equal in all releases."""
+def _types(is_ros2: bool) -> Any:
+    """The usual types, equal in all releases for those read here. Bags of ROS 2 before Iron do not carry theirs."""
     from rosbags.typesys import Stores, get_typestore
 
-    return get_typestore(Stores.ROS2_HUMBLE)
+    return get_typestore(Stores.ROS2_HUMBLE if is_ros2 else Stores.ROS1_NOETIC)
+
+
+def _has_usual_fields(kind: str, found: Any, usual: Any) -> bool:
+    """Whether a bag defines a type and those of its fields as `usual`; true for types that are not in it."""
+    if kind not in usual:
+        return True
+    fields = usual[kind][1]
+    return (
+        kind in found
+        and found[kind][1] == fields
+        and all(_has_usual_fields(name, found, usual) for name in set(_NAMED.findall(repr(fields))))
+    )
 
 
 def _reason(error: Exception) -> str:

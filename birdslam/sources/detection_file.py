@@ -153,7 +153,7 @@ def _coco(path: Path, text: str) -> Iterator[tuple[str, _Box]]:
     for number, entry in enumerate(entries):
         try:
             yield f"entry {number}", _coco_box(entry, labels)
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise DatasetError(f"{path}: entry {number} is not a box of COCO results: {error}") from None
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,6 +28,7 @@ KITTI_RATE_HZ = 10.0
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 IMAGE_NUMBER = re.compile(r"[0-9]{1,12}")
 JPEG_BEGIN, JPEG_END = b"\xff\xd8", b"\xff\xd9"
+PNG_BEGIN = b"\x89PNG\r\n\x1a\n"
 
 
 @dataclass(frozen=True)
@@ -119,13 +121,22 @@ def decode_image(data: bytes) -> NDArray[np.uint8]:
     """Decodes a PNG or JPEG file to 8 bit, grey or BGR. Raises ValueError with the reason."""
     if data.startswith(JPEG_BEGIN) and JPEG_END not in data[-32:]:
         raise ValueError("truncated JPEG")  # OpenCV would fill the rest with grey
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error:
-        image = None
+    image = None
+    if not data.startswith(PNG_BEGIN) or _has_whole_chunks(data):
+        with suppress(cv2.error):
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
         raise ValueError(f"damaged or not an image ({len(data)} bytes)")
     return image  # type: ignore[return-value]
+
+
+def _has_whole_chunks(png: bytes) -> bool:
+    """OpenCV allocates what a damaged chunk states, up to 4 GB."""
+    at, name = len(PNG_BEGIN), b""
+    while at < len(png) and name != b"IEND":
+        name = png[at + 4 : at + 8]
+        at += 12 + int.from_bytes(png[at : at + 4], "big")  # length, name, content, checksum
+    return name == b"IEND" and at <= len(png)
 
 
 def first_image_size(folder: Path, images: dict[int, Path]) -> tuple[Path, tuple[int, int]]:

@@ -64,6 +64,12 @@ def _is_kitti(path: Path) -> bool:
         return False
 
 
+def _is_raw_stream(path: Path) -> bool:
+    from birdslam.sources.films.container import is_raw_stream
+
+    return path.is_file() and is_raw_stream(path)
+
+
 DEMO = Scheme(
     name="demo",
     written=("demo", "demo:DIR"),
@@ -81,6 +87,7 @@ VIDEO = Scheme(
     clock="recorded times",
     refused=("topics",),
     suffixes=(".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".ts", ".m2ts", ".mts", ".mpg", ".3gp", ".flv", ".wmv"),
+    is_at=_is_raw_stream,  # and refuses it with the command that gives it a container
 )
 ROSBAG = Scheme(
     name="rosbag",

@@ -17,7 +17,7 @@ from birdslam.geometry.arrays import Floats
 from birdslam.loops.gnss.files import GnssError, read_fixes
 from birdslam.sources.recording import DatasetError, Recording, check_times
 from birdslam.sources.speed_log import SpeedLog
-from birdslam.sources.speed_tables import fix_speeds, names_columns, table_readings
+from birdslam.sources.speed_tables import MAX_S, fix_speeds, names_columns, table_readings
 from birdslam.types import NS_PER_S, SpeedReading
 
 # 1-sigma if a file states none: some steps of a wheel speed message (often 0.1 km/h), and the bias of a stability
@@ -26,7 +26,6 @@ SIGMA_MPS = 0.1
 YAW_RATE_SIGMA_RADPS = 0.01
 
 _MAX_COLUMNS = 5
-_MAX_S = 9e9  # ns since 1970 exceed int64 above this
 
 
 def read_speeds(path: Path, begin_ns: int = 0) -> SpeedLog:
@@ -114,7 +113,7 @@ def _of_track(path: Path, data: bytes, begin_ns: int) -> Iterator[tuple[int, Spe
 def _reading(words: list[str]) -> SpeedReading:
     """Parses a reading. Raises ValueError."""
     t_s, speed_mps, *rest = (float(word) if word.strip() else None for word in words)
-    if t_s is None or speed_mps is None or not abs(t_s) < _MAX_S or len(words) > _MAX_COLUMNS:
+    if t_s is None or speed_mps is None or not abs(t_s) < MAX_S or len(words) > _MAX_COLUMNS:
         raise ValueError
     sigma_mps, yaw_rate_radps, yaw_rate_sigma_radps = (*rest, None, None, None)[:3]
     if yaw_rate_radps is not None and yaw_rate_sigma_radps is None:

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 
+from birdslam.loops.gnss.earth import is_on_earth
 from birdslam.sources.recording import DatasetError
 from birdslam.types import NS_PER_S, SpeedReading
 
@@ -28,6 +29,7 @@ _YAW_RATE_SIGMA_RADPS = 0.01
 _SPEED_SIGMA_MPS = 0.1
 _Row = tuple[int, dict[str, float]]  # line number, values by quantity
 _EARTH_M = 6_371_000.0
+MAX_S = 9e9  # of a time: ns since 1970 exceed int64 above this
 _MIN_GAP_NS = 250_000_000  # larger gaps between readings are interpolated
 _MAX_GAP_NS = 3 * NS_PER_S  # larger gaps are not interpolated
 _INTERPOLATED_NS = 100_000_000
@@ -53,7 +55,9 @@ def table_readings(path: Path, lines: Sequence[tuple[int, str]]) -> Iterator[tup
         cells = _cells(text)
         try:
             rows.append((number, {name: float(cells[at]) * unit for name, (at, unit) in columns.items() if cells[at]}))
-            if "time" not in rows[-1][1]:
+            row = rows[-1][1]
+            is_place = is_on_earth(row.get("latitude", 0.0), row.get("longitude", 0.0))
+            if not abs(row.get("time", math.inf)) < MAX_S or not is_place:
                 raise ValueError
         except (ValueError, IndexError):
             raise DatasetError(f"{path}: line {number} does not match the header: {text[:40]!r}") from None

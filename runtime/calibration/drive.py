@@ -155,7 +155,9 @@ def _open(uri: str, lens: Intrinsics | None, height_m: float | None, stride: int
         calibrated = parsed(uri)[0].camera in ("calibration", "intrinsics")  # a video may have any size
         size = frame_size(uri, topics) if calibrated else None
         if size is None:
-            raise DatasetError(f"{lens.source}: has no image size")
+            raise DatasetError(
+                f"{lens.source}: has no image size, which a film does not show; write the camera as camera_info of ROS"
+            )
         width_px, height_px = size
     try:
         camera = Camera(

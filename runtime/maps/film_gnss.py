@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 
 from birdslam.loops.gnss.earth import is_on_earth
-from birdslam.loops.gnss.files import GnssError, read_fixes
+from birdslam.loops.gnss.files import MAX_S, GnssError, read_fixes
 from birdslam.loops.gnss.subtitles import cue_fixes
 from birdslam.outputs.earth_files import GeoLine, write_geo_lines
 from birdslam.types import NS_PER_S
@@ -59,9 +59,15 @@ def read_film(path: Path) -> list[FilmFix]:
     command = [_PROGRAM, "-ee", "-json", "-n", "-G3", "-api", "LargeFileSupport=1", *_TAGS]
     try:
         done = subprocess.run([*command, "--", str(path)], capture_output=True, check=False, timeout=_LIMIT_S)
-        (tags,) = msgspec.json.decode(done.stdout, type=list[dict[str, Any]])
     except subprocess.TimeoutExpired:
         raise GnssError(f"{path}: ExifTool did not finish in {_LIMIT_S:g} s") from None
+    return fixes_of_tags(done.stdout)
+
+
+def fixes_of_tags(data: bytes) -> list[FilmFix]:
+    """Returns the fixes in ExifTool's JSON of a film, in its order."""
+    try:
+        (tags,) = msgspec.json.decode(data, type=list[dict[str, Any]])
     except (msgspec.MsgspecError, ValueError):
         return []  # a file that is no film is reported when it is opened
     samples: dict[str, dict[str, Any]] = {}
@@ -76,11 +82,13 @@ def read_film(path: Path) -> list[FilmFix]:
 def _of_subtitle_track(samples: Iterable[dict[str, Any]]) -> list[FilmFix]:
     """The fixes in the texts of a subtitle track."""
     cues = (
-        (float(sample["SampleTime"]), str(sample["Text"]))
-        for sample in samples
-        if sample.keys() >= {"SampleTime", "Text"}
+        (t_s, str(sample["Text"])) for sample in samples if "Text" in sample and (t_s := _t_film_s(sample)) is not None
     )
-    return [FilmFix(latitude, longitude, None, t_s) for _, (t_s, latitude, longitude, *_) in cue_fixes(cues)]
+    return [
+        FilmFix(latitude, longitude, None, t_s)
+        for _, (t_s, latitude, longitude, *_) in cue_fixes(cues)
+        if is_on_earth(latitude, longitude)
+    ]
 
 
 def track_of_films(films: Sequence[Path], path: Path) -> int:
@@ -120,13 +128,21 @@ def fixes_beside(film: Path) -> list[FilmFix]:
 def _fix(sample: dict[str, Any]) -> FilmFix | None:
     try:
         latitude, longitude = float(sample["GPSLatitude"]), float(sample["GPSLongitude"])
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, OverflowError):
         return None
-    utc, t_film_s = _utc(str(sample.get("GPSDateTime", ""))), sample.get("SampleTime")
-    is_timed = utc is not None or isinstance(t_film_s, int | float)
-    if not is_timed or not is_on_earth(latitude, longitude) or (latitude == 0.0 and longitude == 0.0):
+    utc, t_film_s = _utc(str(sample.get("GPSDateTime", ""))), _t_film_s(sample)
+    if (
+        (utc is None and t_film_s is None)
+        or not is_on_earth(latitude, longitude)
+        or (latitude == 0.0 and longitude == 0.0)
+    ):
         return None
     return FilmFix(latitude, longitude, utc, t_film_s)
+
+
+def _t_film_s(sample: dict[str, Any]) -> float | None:
+    t_s = sample.get("SampleTime")
+    return t_s if isinstance(t_s, int | float) and abs(t_s) < MAX_S else None
 
 
 def _utc(text: str) -> datetime | None:

@@ -35,7 +35,7 @@ _NAMES = {  # other names of the columns, and the factor to our unit
     **dict.fromkeys(("speed_kmh", "speed_kph"), ("speed_mps", 1.0 / 3.6)),
     **dict.fromkeys(("speed_mph",), ("speed_mps", 0.44704)),
 }
-_SENTENCE = re.compile(r"^\s*(\[\d+\])?[$!](?=[A-Z]{2})", re.MULTILINE)
+_SENTENCE = re.compile(r"^[ \t]*(\[\d+\])?[$!](?=[A-Z]{2})", re.MULTILINE)
 
 
 class GnssError(ValueError):

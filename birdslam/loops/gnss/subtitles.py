@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator
 from birdslam.loops.gnss.earth import DEFAULT_SIGMA_M
 from birdslam.loops.gnss.sentences import Sentence
 
-CUE = re.compile(r"^\s*(\d+):(\d\d):(\d\d)[,.](\d{1,3})\s*-->.*$", re.MULTILINE)
+CUE = re.compile(r"^[ \t]*(\d{1,6}):(\d\d):(\d\d)[,.](\d{1,3})\s*-->.*$", re.MULTILINE)
 _NUMBER = r"([+-]?\d{1,3}\.\d+)"
 _NAMED = tuple(re.compile(rf"{name}\w*\s*[:=]?\s*{_NUMBER}", re.IGNORECASE) for name in (r"\blat", r"\blon"))
 _LONGITUDE_FIRST = re.compile(rf"\bGPS\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}")
