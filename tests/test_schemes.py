@@ -30,6 +30,14 @@ NO_NETWORK = ("--model", "none")
 # --- the entries ---
 
 
+def test_a_folder_of_bags_is_not_taken_for_films(tmp_path: Path) -> None:
+    """A bag of ROS 2 without its metadata.yaml, or several of ROS 1."""
+    for name in ("a.bag", "b.bag", "notes.txt"):
+        (tmp_path / name).touch()
+    with pytest.raises(ValueError, match=r"name one of its bags: a\.bag, b\.bag$"):
+        schemes.uri_of(str(tmp_path), table.all_schemes())
+
+
 @EVERY
 def test_an_entry_is_written_as_it_is_read(scheme: Scheme) -> None:
     for text in scheme.written:

@@ -10,11 +10,14 @@ import numpy as np
 import pytest
 
 from birdslam.geometry.camera import Camera
-from birdslam.sources.opening import open_recording
+from birdslam.runtime.configuration import RecordingConfig
+from birdslam.runtime.nodes.sources import open_recorded
+from birdslam.runtime.recording.scene import from_image
+from birdslam.runtime.schemes import recorded_schemes
 from birdslam.sources.recording import RecordedFrame, Recording
-from birdslam.sources.schemes import RECORDED
 from birdslam.types import NS_PER_S, Status
 from tests.ros_bags import camera_info, image, write_bag
+from tests.taped_drive import Tape, measured
 from tests.test_datasets import P2, write_images
 from tests.test_films import film
 
@@ -58,6 +61,18 @@ def _kitti(folder: Path) -> tuple[str, Camera | None]:
     return f"kitti:{folder}", None
 
 
+def _recorded(folder: Path) -> tuple[str, Camera | None]:
+    """A drive recorded with its images, but for one frame."""
+    tape = Tape(folder, recording=RecordingConfig(file="drive.mcap", images=True))
+    for number, measurements in enumerate(measured(20)):
+        ref = tape.frame(measurements)
+        if number != 7:
+            grey = np.full((192, 640), 10 * number, dtype=np.uint8)
+            tape.writer.draw(*from_image(grey, 90, ref.t_utc_ns), number)
+    tape.close()
+    return f"mcap:{tape.path}", None
+
+
 MAKERS: dict[str, Callable[[Path], tuple[str, Camera | None]]] = {
     "video": _film,
     "video, files": _films,
@@ -65,6 +80,7 @@ MAKERS: dict[str, Callable[[Path], tuple[str, Camera | None]]] = {
     "rosbag, ROS 1": lambda folder: _bag(folder, "ros1"),
     "kitti": _kitti,
     "demo": lambda folder: ("demo", None),
+    "mcap": _recorded,
 }
 MAX_FRAMES = 40  # of the shipped drive
 
@@ -73,7 +89,7 @@ MAX_FRAMES = 40  # of the shipped drive
 def opened(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], Recording]:
     """Opens the same recording with a stride."""
     uri, camera = MAKERS[request.param](tmp_path_factory.mktemp("source"))
-    return lambda stride: open_recording(uri, camera, stride)
+    return lambda stride: open_recorded(uri, camera, stride)
 
 
 def _frames(recording: Recording, start: int = 0) -> list[RecordedFrame]:
@@ -87,7 +103,7 @@ def _same(one: RecordedFrame, other: RecordedFrame) -> bool:
 
 
 def test_every_kind_of_recording_is_here() -> None:
-    assert {name.split(",")[0] for name in MAKERS} == {scheme.name for scheme in RECORDED}
+    assert {name.split(",")[0] for name in MAKERS} == {scheme.name for scheme in recorded_schemes()}
 
 
 def test_frames_are_numbered_in_order_of_increasing_time(opened: Callable[[int], Recording]) -> None:

@@ -51,19 +51,20 @@ class Bag:
         if not path.exists():
             raise BagError(f"{path}: no such file or directory")
         self._stack = ExitStack()
+        self.types: dict[str, str] = {}  # topic -> message type, as in "sensor_msgs/Image"
+        self.counts: dict[str, int] = {}  # topic -> messages
         try:
             reader = AnyReader([path], default_typestore=_types(is_ros2=True))
             self._reader = self._stack.enter_context(reader)
+            for connection in sorted(self._reader.connections, key=lambda one: one.topic):
+                kind = connection.msgtype.replace("/msg/", "/")
+                usual = _types(self._reader.is2).fielddefs
+                is_usual = _has_usual_fields(connection.msgtype, self._reader.typestore.fielddefs, usual)
+                self.types[connection.topic] = kind if is_usual else f"{kind} with other fields"
+                self.counts[connection.topic] = self.counts.get(connection.topic, 0) + connection.msgcount
         except Exception as error:  # storages, YAML and compression raise many types for a damaged file
+            self._stack.close()
             raise BagError(f"{path}: is not a readable ROS bag: {_reason(error)}") from None
-        self.types: dict[str, str] = {}  # topic -> message type, as in "sensor_msgs/Image"
-        self.counts: dict[str, int] = {}  # topic -> messages
-        for connection in sorted(self._reader.connections, key=lambda one: one.topic):
-            kind = connection.msgtype.replace("/msg/", "/")
-            usual = _types(self._reader.is2).fielddefs
-            is_usual = _has_usual_fields(connection.msgtype, self._reader.typestore.fielddefs, usual)
-            self.types[connection.topic] = kind if is_usual else f"{kind} with other fields"
-            self.counts[connection.topic] = self.counts.get(connection.topic, 0) + connection.msgcount
 
     def __enter__(self) -> Self:
         return self

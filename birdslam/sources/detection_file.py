@@ -159,7 +159,8 @@ def _coco(path: Path, text: str) -> Iterator[tuple[str, _Box]]:
 
 def _coco_labels(path: Path, entries: list[Any]) -> dict[int, str]:
     """Class names by id: of the id set that contains all ids; if both do, of the one with more cars."""
-    ids = Counter(entry.get("category_id") for entry in entries if isinstance(entry, dict))
+    given = (entry.get("category_id") for entry in entries if isinstance(entry, dict))
+    ids = Counter(number for number in given if isinstance(number, int | float))
     numbers = {number for number in ids if isinstance(number, int)}
     of_2017 = all(1 <= number <= COCO_LAST for number in numbers) and COCO_GAPS.isdisjoint(numbers)
     of_80 = all(0 <= number < 80 for number in numbers)

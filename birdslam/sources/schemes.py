@@ -157,7 +157,12 @@ def uri_of(text: str, schemes: Sequence[Scheme]) -> str:
         return text
     if not path.exists():
         raise ValueError(f"{text}: there is no such file, and no such source; expected a path or {written(schemes)}")
-    found = scheme_at(path, schemes) or (VIDEO if path.is_dir() else None)
+    found = scheme_at(path, schemes)
+    if found is None and path.is_dir():
+        inside = [file.name for file in path.iterdir() if not file.is_dir() and scheme_at(file, (ROSBAG,))]
+        if inside:
+            raise ValueError(f"{text}: has no metadata.yaml; name one of its bags: {', '.join(sorted(inside))}")
+        found = VIDEO
     if found is None:
         kinds = [scheme for scheme in schemes if scheme.address == "path" and not scheme.live]
         raise ValueError(f"{text}: not recognized; name its kind: {written(kinds)}")

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-import cv2
 import msgspec
-import numpy as np
 
 from birdslam.geometry.camera import Camera
 from birdslam.runtime.configuration import RecordingConfig
@@ -16,6 +14,7 @@ from birdslam.runtime.recording.recording import Recording as File
 from birdslam.runtime.recording.recording import RecordingError
 from birdslam.runtime.recording.scene import timestamp
 from birdslam.runtime.wire import WireError, decode
+from birdslam.sources.kitti import decode_image
 from birdslam.sources.recording import DatasetError, RecordedFrame, Recording
 from birdslam.types import NS_PER_S, FrameRef, Status
 
@@ -61,8 +60,12 @@ class RecordedImages(Recording):
             number = ref.frame_id - self._first.frame_id
             if number % self._stride or number // self._stride < start:
                 continue
-            pixels = None if image is None else _pixels(image)
-            error = None if pixels is not None else f"frame {ref.frame_id} was not recorded"
+            pixels, error = None, None if image is not None else f"frame {ref.frame_id} was not recorded"
+            if image is not None:
+                try:
+                    pixels = decode_image(image.data)
+                except ValueError as damaged:
+                    error = f"{self._file.path}: frame {ref.frame_id}: {damaged}"
             yield RecordedFrame(number // self._stride, ref.t_source_ns, pixels, error, ref.speeds)
 
     def _pairs(self) -> Iterator[tuple[FrameRef, CompressedImage | None]]:
@@ -100,7 +103,3 @@ def _between(before: FrameRef, after: FrameRef) -> Iterator[FrameRef]:
     for step in range(1, gap):
         t_source_ns = before.t_source_ns + (after.t_source_ns - before.t_source_ns) * step // gap
         yield msgspec.structs.replace(before, frame_id=before.frame_id + step, t_source_ns=t_source_ns, speeds=())
-
-
-def _pixels(image: CompressedImage) -> np.ndarray | None:
-    return cv2.imdecode(np.frombuffer(image.data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)

@@ -71,7 +71,7 @@ def undated_fixes(lines: Iterable[str], near_s: float) -> Iterator[tuple[int, Se
         if words is None or words[0][-3:] != "GGA" or len(words) < 9 or words[6] in ("", "0"):
             continue
         try:
-            t_s = 3600.0 * int(words[1][:2]) + 60.0 * int(words[1][2:4]) + float(words[1][4:])
+            t_s = 3600.0 * int(words[1][:2]) + 60.0 * int(words[1][2:4]) + _seconds(words[1])
             latitude_deg, longitude_deg = _degrees(words[2], words[3]), _degrees(words[4], words[5])
             sigma_m = SIGMA_PER_HDOP_M * float(words[8]) if words[8] else DEFAULT_SIGMA_M
         except ValueError:
@@ -96,10 +96,16 @@ def _words(line: str) -> list[str] | None:
         return None
 
 
-def _utc(date: str, time: str) -> float:
+def _seconds(time: str) -> float:
+    """The seconds of a time hhmmss.sss. Raises ValueError."""
     seconds = float(time[4:])
     if not 0.0 <= seconds < 61.0:
         raise ValueError(f"{time} is no time")
+    return seconds
+
+
+def _utc(date: str, time: str) -> float:
+    seconds = _seconds(time)
     day = datetime(2000 + int(date[4:6]), int(date[2:4]), int(date[:2]), int(time[:2]), int(time[2:4]), tzinfo=UTC)
     return day.timestamp() + seconds
 
