@@ -117,6 +117,14 @@ def test_frames_are_numbered_in_order_of_increasing_time(opened: Callable[[int],
     assert times_ns[-1] - times_ns[0] < 2 * PAUSE_S * NS_PER_S  # one clock, whatever steps
 
 
+@pytest.mark.parametrize("storage", ["mcap", "ros1"])
+def test_a_clock_that_was_set_is_reported(storage: str, tmp_path: Path) -> None:
+    uri, camera = _bag(tmp_path, storage)
+    notes = {frame.index: frame.note for frame in open_recorded(uri, camera).frames() if frame.note}
+    assert list(notes) == [12]
+    assert "was set by -86400.000 s" in notes[12]
+
+
 def test_images_have_the_size_of_the_camera_or_a_reason(opened: Callable[[int], Recording]) -> None:
     recording = opened(1)
     camera = recording.camera

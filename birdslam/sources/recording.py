@@ -32,6 +32,7 @@ class RecordedFrame:
     image: NDArray[np.uint8] | None
     error: str | None = None
     speeds: tuple[SpeedReading, ...] = ()  # as in `Frame`
+    note: str | None = None  # for the log
 
 
 class OwnLens(NamedTuple):

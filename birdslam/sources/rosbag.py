@@ -7,6 +7,7 @@ previous one is an unreadable frame, and a damaged bag ends with one.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -145,18 +146,21 @@ class RosbagRecording(Recording):
 
     def frames(self, start: int = 0) -> Iterator[RecordedFrame]:
         """Yields the frames in order; images are decoded on demand."""
-        last_ns, position, clock = None, -1, ImageClock()
+        last_ns, position, clock, step_ns = None, -1, ImageClock(), 0
         try:
             with Bag(self._path) as bag:
                 for position, message in enumerate(bag.messages(self._topic)):
                     t_ns = clock.time_ns(self._time_ns(message), message.t_ns)
+                    step_ns += clock.step_ns
                     late = last_ns is not None and t_ns <= last_ns
                     last_ns = last_ns + 1 if late and last_ns is not None else t_ns
                     index, between = divmod(position, self._stride)
                     if between or index < start:
                         continue
                     error = f"its time {t_ns / NS_PER_S:.3f} s is not later than the previous one" if late else None
-                    yield self._frame(index, last_ns, message, error)
+                    frame = self._frame(index, last_ns, message, error)
+                    yield replace(frame, note=_step_note(step_ns)) if step_ns else frame
+                    step_ns = 0
             if position + 1 < self._count:
                 raise BagError(f"{self._path}: {self._topic} ends after {position + 1} of {self._count} images")
         except BagError as error:
@@ -204,16 +208,23 @@ class ImageClock:
 
     def __init__(self) -> None:
         self._shift_ns = 0
+        self.step_ns = 0  # by which the stamps' clock was set before the last image
         self._last: tuple[int, int] | None = None  # stamp and receive time
 
     def time_ns(self, stamp_ns: int, recorded_ns: int) -> int:
         """The time of the next image in the clock of the first."""
+        self.step_ns = 0
         if self._last is not None:
             by_stamps, by_recording = stamp_ns - self._last[0], recorded_ns - self._last[1]
             if abs(by_stamps - by_recording) > MAX_CLOCK_ERROR_NS and by_recording >= 0:
-                self._shift_ns += by_recording - by_stamps
+                self.step_ns = by_stamps - by_recording
+                self._shift_ns -= self.step_ns
         self._last = stamp_ns, recorded_ns
         return stamp_ns + self._shift_ns
+
+
+def _step_note(step_ns: int) -> str:
+    return f"the clock of the stamps was set by {step_ns / NS_PER_S:+.3f} s; the times continue by the receive times"
 
 
 def _image_topic(bag: Bag, topics: BagTopics) -> str:

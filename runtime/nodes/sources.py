@@ -185,6 +185,8 @@ def to_frame(
     image, error = undistorted(undistort, recorded)
     if image is None:
         log.warning("frame %d is unreadable: %s", frame_id, error)
+    if recorded.note:
+        log.warning("frame %d: %s", frame_id, recorded.note)
     status = (Status.FRAME_UNREADABLE,) if image is None else ()
     return Frame(frame_id, recorded.t_source_ns, t_capture_ns, t_utc_ns, image, status, recorded.speeds)
 
