@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from birdslam.odometry.corners.feature_tracks import FeatureConfig, FeatureTracker
+from birdslam.odometry.corners.feature_tracks import FeatureConfig, FeatureTracker, Tracks
 from birdslam.odometry.corners.templates import CornerTemplates
 
 WIDTH_PX, HEIGHT_PX = 640, 240
@@ -88,3 +88,29 @@ def test_a_corner_that_is_covered_is_lost() -> None:
     covered = tracks.px[old, 0] > 330.0
     assert covered.mean() < 0.03
     assert old.sum() > 50
+
+
+def near_road(x_m: float) -> NDArray[np.uint8]:
+    """A textured road, seen by a level camera at a height of 1.65 m, `x_m` along the road."""
+    u, v = np.meshgrid(np.arange(WIDTH_PX, dtype=np.float32), np.arange(HEIGHT_PX, dtype=np.float32))
+    ahead_m = 260.0 * 1.65 / np.maximum(v - CENTRE[1], 0.5)
+    side_m = (u - CENTRE[0]) * ahead_m / 260.0
+    at = (24.0 * side_m + WIDTH_PX).astype(np.float32), (24.0 * (ahead_m + x_m)).astype(np.float32)
+    return cv2.remap(texture(), *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP).astype(np.uint8)
+
+
+def test_the_near_road_is_tracked_at_a_low_frame_rate() -> None:
+    """Its patches are stretched by more than one alignment covers."""
+
+    def predict(reference: Tracks) -> NDArray[np.float64]:
+        ahead_m = 260.0 * 1.65 / np.maximum(reference.px[:, 1] - CENTRE[1], 0.5)
+        return (reference.px - CENTRE) * (ahead_m / np.maximum(ahead_m - 0.8, 0.5))[:, None] + CENTRE
+
+    tracker = FeatureTracker(WIDTH_PX, HEIGHT_PX, FeatureConfig())
+    first = tracker.track(near_road(0.0))
+    tracker.accept(first)
+    tracks = tracker.track(near_road(0.8), predict)
+    old = tracks.age > 0
+    error_px = tracks.px[old] - predict(first)[np.searchsorted(first.ids, tracks.ids[old])]
+    assert old.sum() > 100
+    assert np.median(np.abs(error_px).max(axis=1)) < 1.0

@@ -30,6 +30,7 @@ Bools = NDArray[np.bool_]
 # Maximum iterations and minimum step (px) of Lucas-Kanade; the alignment with the templates is more accurate
 _FLOW_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 4, 0.2)
 _BACKWARD_OFFSET_PX = 2.0
+_MIN_ALIGNED = 0.5  # of the corners, for those that do not look like their templates to be lost
 _MARGIN_PX = 2.0  # of corners to the border of the image
 # Of predicted corners: depth over the assumed depth, displacement over the image width
 _MIN_DEPTH_RATIO, _MAX_SHIFT_RATIO = 0.3, 0.4
@@ -127,10 +128,8 @@ class FeatureTracker:
         if self._reference_image is not None and len(ids):
             followed, good = self._follow_reference(self._reference_image, grey, predict, search)
             ids, age, flow = ids[good], age[good] + 1, (followed - px)[good]
-            aligned = self._templates.align(grey, ids, followed[good])
-            good = aligned.good & self._is_inside(aligned.px)
-            ids, px, age, flow = ids[good], aligned.px[good], age[good], flow[good]
-            self._scale = aligned.scale[good]
+            px, self._scale, good = self._align(grey, ids, followed[good])
+            ids, px, age, flow, self._scale = ids[good], px[good], age[good], flow[good], self._scale[good]
         fresh = self._new_corners(grey, px)
         ids = np.concatenate([ids, np.arange(self._next_id, self._next_id + len(fresh))])
         self._next_id += len(fresh)
@@ -196,6 +195,18 @@ class FeatureTracker:
             better = found & (~good | (its_error < error))
             at, error, good = np.where(better[:, None], other, at), np.where(better, its_error, error), good | found
         return at, good
+
+    def _align(self, grey: NDArray[np.uint8], ids: Ints, px: Floats) -> tuple[Floats, Floats, Bools]:
+        """Positions (N, 2) of corners aligned with their templates, their scales (N,), and which are not lost (N,).
+
+        If few look like their templates, the patches changed too much between two images, as those of the near road do
+        at a low frame rate: the others keep the flow and get new templates (scale nan).
+        """
+        aligned = self._templates.align(grey, ids, px)
+        good = aligned.good & self._is_inside(aligned.px)
+        if good.sum() > _MIN_ALIGNED * len(good):
+            return aligned.px, aligned.scale, good
+        return np.where(good[:, None], aligned.px, px), np.where(good, aligned.scale, np.nan), np.ones(len(good), bool)
 
     def _is_inside(self, px: Floats) -> Bools:
         """(N,) whether corners (N, 2) are inside the image, with a margin."""

@@ -2,9 +2,7 @@
 
 Optical flow from image to image adds its error to each track; an alignment with the first patch does not (Shi and
 Tomasi 1994). A patch is warped by translation and scale, since a corner's image grows as the camera approaches:
-
     I(px + s g) = a T(g) + b,    g over the patch
-
 One step of inverse compositional Gauss-Newton (Baker and Matthews 2004) for all corners, with contrast a and brightness
 b eliminated.
 """
@@ -77,7 +75,10 @@ class CornerTemplates:
         return Alignment(aligned, scale.astype(np.float64), good)
 
     def update(self, image: Image, ids: Ints, px: Floats, scale: Floats) -> None:
-        """Changes the reference to `image` with corners `ids` (N,), px (N, 2), of which the first (M,) were aligned."""
+        """Changes the reference to `image` with corners `ids` (N,), px (N, 2), of which the first (M,) were aligned.
+
+        `scale` (M,) is that of the alignments, nan for a corner that gets a new template.
+        """
         kept = (scale < _MAX_SCALE) & (scale > 1.0 / _MAX_SCALE)
         fresh = np.concatenate([~kept, np.ones(len(ids) - len(scale), bool)])
         slot, scales = np.zeros(len(ids), np.int64), np.ones(len(ids))
