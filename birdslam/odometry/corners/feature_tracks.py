@@ -30,7 +30,7 @@ Bools = NDArray[np.bool_]
 # Maximum iterations and minimum step (px) of Lucas-Kanade; the alignment with the templates is more accurate
 _FLOW_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 4, 0.2)
 _BACKWARD_OFFSET_PX = 2.0
-_MIN_ALIGNED = 0.5  # of the corners, for those that do not look like their templates to be lost
+_MIN_ALIGNED_RATIO = 0.5  # of corners that look like their templates; below it the others are not lost
 _MARGIN_PX = 2.0  # of corners to the border of the image
 # Of predicted corners: depth over the assumed depth, displacement over the image width
 _MIN_DEPTH_RATIO, _MAX_SHIFT_RATIO = 0.3, 0.4
@@ -204,7 +204,7 @@ class FeatureTracker:
         """
         aligned = self._templates.align(grey, ids, px)
         good = aligned.good & self._is_inside(aligned.px)
-        if good.sum() > _MIN_ALIGNED * len(good):
+        if good.sum() > _MIN_ALIGNED_RATIO * len(good):
             return aligned.px, aligned.scale, good
         return np.where(good[:, None], aligned.px, px), np.where(good, aligned.scale, np.nan), np.ones(len(good), bool)
 

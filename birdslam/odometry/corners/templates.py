@@ -13,25 +13,19 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
-Image = NDArray[np.uint8]
+from birdslam.geometry.arrays import Bools, Floats, Floats32, Image, Ints
 
 _HALF_PX = 7  # half the side of a patch
 _MAX_SCALE = 1.5  # a patch that has grown by more is replaced: the samples would be too sparse
 _MAX_SHIFT_PX = 2.0  # of an alignment, from the optical flow
-_STEP_LIMITS = 0.7, 1.3  # of the scale in one step
-_CONTRAST_LIMITS = 0.3, 3.0  # of a patch, relative to its template
+_MIN_CONTRAST = 0.3  # of a patch, relative to its template
 _MIN_CORRELATION = 0.8  # of an aligned patch
-_DAMPING = 1.0  # information of the translation, grey^2 / px^2
-_FLAT_GREY2 = 1.0  # variance of a patch that is due to noise
+_DAMPING = 1.0  # information that a patch without texture gets
+_NOISE_GREY2 = 1.0  # variance of a patch by noise
 
 
-def _grid(half_px: int) -> tuple[Singles, Singles]:
+def _grid(half_px: int) -> tuple[Floats32, Floats32]:
     v, u = np.mgrid[-half_px : half_px + 1, -half_px : half_px + 1]
     return u.ravel().astype(np.float32), v.ravel().astype(np.float32)
 
@@ -57,8 +51,8 @@ class CornerTemplates:
         self._ids: Ints = np.zeros(0, np.int64)
         self._scale: Floats = np.zeros(0)
         self._slot: Ints = np.zeros(0, np.int64)  # (N,) of each corner in the arrays below, which are never moved
-        self._patch: Singles = np.zeros((0, len(_U)), np.float32)
-        self._gain: Singles = np.zeros((0, 3, len(_U)), np.float32)  # from differences to (u, v, log scale)
+        self._patch: Floats32 = np.zeros((0, len(_U)), np.float32)
+        self._gain: Floats32 = np.zeros((0, 3, len(_U)), np.float32)  # from differences to (u, v, log scale)
 
     def align(self, image: Image, ids: Ints, px: Floats) -> Alignment:
         """Aligns corners of the reference image, `ids` (N,), from their positions (N, 2) by optical flow."""
@@ -69,7 +63,7 @@ class CornerTemplates:
         patch = self._patch[slot]
         now, correlation = _matched(_sample(image, warp), patch)
         step = (self._gain[slot] @ (now - patch)[:, :, None])[..., 0]
-        scale = warp[:, 2] / np.clip(1.0 + step[:, 2], *_STEP_LIMITS)
+        scale = warp[:, 2] * np.exp(-step[:, 2])
         aligned = px - scale[:, None] * step[:, :2]
         good = (np.abs(aligned - px).max(axis=1) < _MAX_SHIFT_PX) & (correlation > _MIN_CORRELATION)
         return Alignment(aligned, scale.astype(np.float64), good)
@@ -99,29 +93,29 @@ class CornerTemplates:
             self._gain = np.concatenate([self._gain, np.zeros((more, *self._gain.shape[1:]), np.float32)])
 
 
-def _sample(image: Image, warp: Singles, grid_u: Singles = _U, grid_v: Singles = _V) -> Singles:
+def _sample(image: Image, warp: Floats32, grid_u: Floats32 = _U, grid_v: Floats32 = _V) -> Floats32:
     """(N, S) grey values of the patches at `warp` (N, 3): u, v, scale."""
     u = warp[:, :1] + warp[:, 2:] * grid_u
     v = warp[:, 1:2] + warp[:, 2:] * grid_v
-    out: Singles = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
+    out: Floats32 = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
     return out
 
 
-def _centred(patch: Singles) -> Singles:
+def _centred(patch: Floats32) -> Floats32:
     """The patches (N, S) without their means."""
-    out: Singles = patch - (patch @ _WEIGHT)[:, None]
+    out: Floats32 = patch - (patch @ _WEIGHT)[:, None]
     return out
 
 
-def _matched(now: Singles, patch: Singles) -> tuple[Singles, Singles]:
+def _matched(now: Floats32, patch: Floats32) -> tuple[Floats32, Floats32]:
     """The patches `now` (N, S), centred and with the contrast of the templates `patch`, and their correlations (N,)."""
     now = _centred(now)
     both, own, old = (now * patch) @ _WEIGHT, (now * now) @ _WEIGHT, (patch * patch) @ _WEIGHT
-    contrast = np.clip((both + _FLAT_GREY2) / (old + _FLAT_GREY2), *_CONTRAST_LIMITS)
-    return now / contrast[:, None], both / np.sqrt((own + _FLAT_GREY2) * (old + _FLAT_GREY2))
+    contrast = np.maximum((both + _NOISE_GREY2) / (old + _NOISE_GREY2), _MIN_CONTRAST)
+    return now / contrast[:, None], both / np.sqrt((own + _NOISE_GREY2) * (old + _NOISE_GREY2))
 
 
-def _templates(image: Image, px: Floats) -> tuple[Singles, Singles]:
+def _templates(image: Image, px: Floats) -> tuple[Floats32, Floats32]:
     """The patches (N, S) at `px` (N, 2), centred, and the gains (N, 3, S) of their alignment."""
     side = 2 * _HALF_PX + 3
     warp = np.column_stack([px, np.ones(len(px))]).astype(np.float32)
@@ -138,7 +132,5 @@ def _templates(image: Image, px: Floats) -> tuple[Singles, Singles]:
     patch = _centred(patch)
     J[:, 0], J[:, 1], J[:, 2], J[:, 3], J[:, 4] = along_u, along_v, along_u * _U + along_v * _V, 1.0, patch
     Jw = J * (_WEIGHT * len(_WEIGHT))
-    H = (Jw @ J.transpose(0, 2, 1)).astype(np.float64)
-    H[:, range(5), range(5)] += 1e-4 * H[:, range(5), range(5)] + 1e-2
-    H[:, range(2), range(2)] += _DAMPING
+    H = (Jw @ J.transpose(0, 2, 1)).astype(np.float64) + _DAMPING * np.eye(5)
     return patch, np.linalg.inv(H)[:, :3].astype(np.float32) @ Jw

@@ -74,7 +74,7 @@ class Bonnet:
             return False
         cv2.accumulateWeighted(np.abs(slope - self._mean), self._deviation, share)
         cv2.accumulateWeighted(slope, self._mean, share)
-        if self._images % (cfg.images // 2):  # half of the mean is old
+        if self._images % (cfg.images // 2):  # the mean has changed little since the last fit
             return False
         before, self.rows = self.rows, self._edge(top_px, *grey.shape)
         return before is None and self.rows is not None
