@@ -59,7 +59,7 @@ exiftool:
 test: browser exiftool setup
 	@$(BIN)/python -m tests.run
 
-# Runs computing tests with the kernels of other processors, or of VARIANT="NAME,..." (perf/accuracy/cpus.py)
+# Runs computing tests with the kernels of other processors, or of VARIANT="NAME,..." (tests/run.py)
 test-cpus: setup
 	@$(BIN)/python -m tests.run --cpus "$(VARIANT)"
 

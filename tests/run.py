@@ -22,12 +22,23 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from birdslam.perf.accuracy.cpus import VARIANTS
-
 ON_EACH_CHANGE = "not slow and not faults and not onroad"
 COMPUTING = f"not processes and {ON_EACH_CHANGE}"
 ON_EACH_CPU = "not processes and not faults and not onroad and (not slow or numeric)"  # with the statistics of starts
 SAMPLE = ("Nehalem", "perturbed tracks 1")
+# Kernels of OpenBLAS, OpenCV and numpy, and numbers of threads, that replace this processor's
+VARIANTS: dict[str, dict[str, str]] = {
+    "native": {},
+    "Nehalem": {"OPENBLAS_CORETYPE": "Nehalem"},
+    "Haswell": {"OPENBLAS_CORETYPE": "Haswell"},
+    "Zen": {"OPENBLAS_CORETYPE": "Zen"},
+    "SkylakeX": {"OPENBLAS_CORETYPE": "SkylakeX"},
+    "OpenCV without AVX-512": {"OPENCV_CPU_DISABLE": "AVX512-SKX"},
+    "OpenCV without AVX2": {"OPENCV_CPU_DISABLE": "AVX512-SKX,AVX2"},
+    "numpy without AVX-512": {"NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR"},
+    "numpy without AVX2": {"NPY_DISABLE_CPU_FEATURES": "X86_V3 X86_V4 AVX512_ICL AVX512_SPR"},
+    "2 threads": {"OPENCV_FOR_THREADS_NUM": "2", "BIRDSLAM_TEST_THREADS": "2"},
+}
 PERTURBED: dict[str, dict[str, str]] = {
     f"perturbed tracks {seed}": {"BIRDSLAM_ROUNDING": str(seed)} for seed in range(1, 4)
 }
