@@ -6,7 +6,7 @@ processors and over perturbed tracks (tests/rounding.py) stands beside its limit
     python -m perf roads motorway_20 motorway_40 ramp_20 ramp_21_glare night_street night_motorway \
         --frames 26 --quality 70 --keep tests/roads
 
-and the clips NAME_compressed went once through `world.compression.VideoEncoder`.
+and the clips NAME_compressed went once through a simulated encoder, which git has in birdslam/world/compression.py.
 """
 
 from __future__ import annotations
@@ -169,7 +169,7 @@ def test_bonnet_covers_only_the_lower_edge(images: list[np.ndarray]) -> None:
 @pytest.mark.parametrize("size", [(640, 192), (621, 187)])
 def test_compression_removes_weak_texture(images: list[np.ndarray], size: tuple[int, int]) -> None:
     sized = [cv2.resize(image, size) for image in images]
-    coarse, fine = VideoEncoder(step=40.0), VideoEncoder(step=2.0)
+    coarse, fine = VideoEncoder(40), VideoEncoder(18)
     errors = []
     for image in sized:
         lost, kept = coarse.code(image), fine.code(image)
@@ -184,7 +184,7 @@ def test_smooth_road_freezes_under_compression() -> None:
     """What moves too faintly to be coded stays where it was: the encoder's worst for an odometry."""
     rng = np.random.default_rng(2)
     grain = cv2.GaussianBlur(rng.normal(0.0, 8.0, (64, 256)), (0, 0), 1.5)
-    encoder = VideoEncoder(step=32.0)
+    encoder = VideoEncoder(36)
     shown = [encoder.code(np.clip(90.0 + grain[:, k : k + 128], 0, 255).astype(np.uint8)) for k in range(0, 9, 3)]
     assert np.abs(shown[1].astype(int) - shown[0]).max() <= 1
     assert encoder.code(np.full((64, 128), 200, np.uint8)).mean() > 150.0  # another scene is coded
