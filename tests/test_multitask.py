@@ -510,8 +510,3 @@ def test_training_writes_a_valid_network_and_resumes(tmp_path: Path) -> None:
         main(["--config", str(path), "--output", str(out)])
         assert load_network("multitask", ModelSpec(path=str(out / "multitask.onnx"))).role == "multitask"
     assert len((out / "curves.csv").read_text().splitlines()) == 4
-    assert (out / "curves.png").stat().st_size > 1000
-    path.write_text(path.read_text().replace("steps = 3", "steps = 0"))
-    start = str(out / "checkpoint.pt")
-    main(["--config", str(path), "--output", str(tmp_path / "mean"), "--start", start, start])
-    assert load_network("multitask", ModelSpec(path=str(tmp_path / "mean" / "multitask.onnx"))).role == "multitask"

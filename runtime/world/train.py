@@ -1,9 +1,9 @@
 """`make train`: trains the shipped network from a seed, on rendered worlds. Needs the extra [train].
 
-    python -m birdslam.runtime.world.train --output out/train [--config FILE.toml] [--start CHECKPOINT...]
+    python -m birdslam.runtime.world.train --output out/train [--config FILE.toml]
 
-The output has `curves.csv` and `.png`, `grades.csv` (held-out worlds), `checkpoint.pt`, and `multitask.onnx` with its
-manifest. The same command continues an interrupted run.
+The output has `curves.csv` (each part of the loss), `grades.csv` (held-out worlds), `checkpoint.pt`, and
+`multitask.onnx` with its manifest. The same command continues an interrupted run.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ _WEIGHTS = "teacher"  # key of the trainer state in a checkpoint; kept to read o
 class Training:
     """One training run with its output directory."""
 
-    def __init__(self, config: TrainConfig, output: Path, start: Sequence[Path], rank: int) -> None:
+    def __init__(self, config: TrainConfig, output: Path, rank: int) -> None:
         self.config, self.output, self.rank = config, output, rank
         torch.manual_seed(config.seed)
         torch.set_num_threads(config.threads)
@@ -121,8 +121,6 @@ class Training:
             state = torch.load(checkpoint, weights_only=True)
             self.trainer.load(state[_WEIGHTS])
             self.stage, self.step = state["stage"], state["step"]
-        elif start:
-            self.trainer.begin(*(torch.load(path, weights_only=True)[_WEIGHTS] for path in start))
 
     def run(self) -> None:
         """Runs the remaining stages from the step of the checkpoint."""
@@ -135,8 +133,6 @@ class Training:
             self._save()
         if self.rank == 0:
             self._export(self._grade(self.config.stages[-1], self.stage, self.config.final_frames))
-            if (self.output / "curves.csv").exists():  # missing if no step was run
-                draw_curves(self.output)
 
     def _learn(self, stage: Stage, number: int) -> None:
         stream = msgspec.structs.replace(
@@ -230,34 +226,11 @@ def _append(path: Path, row: Mapping[str, Any]) -> None:
         writer.writerow({key: f"{value:.5g}" if isinstance(value, float) else value for key, value in row.items()})
 
 
-def draw_curves(output: Path) -> None:
-    """Draws curves.png: each part of the loss over the rows of curves.csv."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    with (output / "curves.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    names = [name for name in rows[0] if name not in ("stage", "step", "seconds", "waited", "norm")]
-    figure, axes = pyplot.subplots(3, (len(names) + 2) // 3, figsize=(16, 9))
-    for axis, name in zip(axes.flat, names, strict=False):
-        axis.plot([float(row[name]) for row in rows], linewidth=0.7)
-        axis.set_title(name)
-        axis.set_yscale("symlog", linthresh=0.01)
-        for index in range(1, len(rows)):
-            if rows[index]["stage"] != rows[index - 1]["stage"]:
-                axis.axvline(index, color="grey")
-    figure.tight_layout()
-    figure.savefig(output / "curves.png", dpi=90)
-    pyplot.close(figure)
-
-
-def _learn(rank: int, config: TrainConfig, output: Path, start: Sequence[Path], meeting: str | None) -> None:
+def _learn(rank: int, config: TrainConfig, output: Path, meeting: str | None) -> None:
     """Runs one training process."""
     if meeting is not None:
         distributed.init_process_group("gloo", init_method=meeting, rank=rank, world_size=config.processes)
-    Training(config, output, start, rank).run()
+    Training(config, output, rank).run()
     if meeting is not None:
         distributed.destroy_process_group()
 
@@ -268,9 +241,6 @@ def main(arguments: list[str] | None = None) -> None:
     )
     parser.add_argument("--output", type=Path, default=Path("out/train"))
     parser.add_argument("--config", type=Path, help="TOML file of differences from the defaults")
-    parser.add_argument(
-        "--start", type=Path, nargs="+", default=[], help="start from the mean weights of these checkpoints"
-    )
     options = parser.parse_args(arguments)
     os.environ["NUMBA_NUM_THREADS"] = "1"  # the workers run in parallel
     config = TrainConfig()
@@ -278,12 +248,11 @@ def main(arguments: list[str] | None = None) -> None:
         config = msgspec.toml.decode(options.config.read_bytes(), type=TrainConfig)
     options.output.mkdir(parents=True, exist_ok=True)
     if config.processes == 1:
-        _learn(0, config, options.output, options.start, None)
+        _learn(0, config, options.output, None)
     else:
         with tempfile.TemporaryDirectory(prefix="train") as folder:
             meeting = f"file://{folder}/meeting"
-            arguments_of_each = (config, options.output, options.start, meeting)
-            torch.multiprocessing.spawn(_learn, arguments_of_each, nprocs=config.processes)
+            torch.multiprocessing.spawn(_learn, (config, options.output, meeting), nprocs=config.processes)
 
 
 if __name__ == "__main__":

@@ -101,21 +101,6 @@ class Trainer:
         self.average.load_state_dict(state["average"])
         self.optimiser.load_state_dict(state["optimiser"])
 
-    def begin(self, *states: dict[str, Any]) -> None:
-        """Initializes from the mean weights of other states; missing weights keep their values, the optimizer restarts.
-
-        The mean of runs from common initial weights reduces their noise (Wortsman et al. 2022). Raises ValueError for
-        weights that this network lacks, and for states of different networks.
-        """
-        for name in ("network", "average"):
-            weights = [state[name] for state in states]
-            if any(other.keys() != weights[0].keys() for other in weights):
-                raise ValueError("cannot average checkpoints of different networks")
-            mean = {key: _mean([other[key] for other in weights]) for key in weights[0]}
-            unexpected = getattr(self, name).load_state_dict(mean, strict=False).unexpected_keys
-            if unexpected:
-                raise ValueError(f"weights of another network: {', '.join(unexpected[:3])}")
-
     @torch.no_grad()
     def raw_outputs(self, image: Floats32) -> dict[str, Floats32]:
         """Outputs by name of the averaged network for images (B, 3, H, W) in [-1, 1]."""
@@ -123,11 +108,6 @@ class Trainer:
         with torch.autocast("cpu", torch.bfloat16, enabled=self.half):
             outputs = self.average(torch.from_numpy(image))
         return {name: output.float().numpy() for name, output in zip(OUTPUTS, outputs, strict=True)}
-
-
-def _mean(tensors: Sequence[Tensor]) -> Tensor:
-    """The mean of weights; the last value of counters."""
-    return torch.stack(list(tensors)).mean(dim=0) if tensors[0].is_floating_point() else tensors[-1]
 
 
 def as_tensors(examples: Examples) -> tuple[Tensor, ...]:
