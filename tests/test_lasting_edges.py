@@ -59,9 +59,9 @@ def variances(frames: int, ego_mps: float, config: GraphConfig) -> Floats:
         t_ns, step = round(1e8 * k), SE2(ego_mps / 10.0)
         cc = EgoEdge(from_frame=k - 1, to_frame=k, T_from_to=step, cov=EXACT) if k else None
         cv = VehicleEdge(vehicle=1, frame=k, T_ego_vehicle=SE2(60.0 - k * step.x_m), cov=cov)
-        graph.optimise(Measurements(frame_id=k, t_source_ns=t_ns, t_capture_ns=t_ns, t_utc_ns=t_ns, cc=cc, cv=(cv,)))
-    ((_, found),) = graph.vehicles_in_ego().values()
-    return np.diag(found)[:2]
+        record = Measurements(frame_id=k, t_source_ns=t_ns, t_capture_ns=t_ns, t_utc_ns=t_ns, cc=cc, cv=(cv,))
+        (vehicle,) = graph.optimise(record).vehicles
+    return np.diag(np.reshape(vehicle.cov, (3, 3)))[:2]
 
 
 def test_correlated_error_does_not_average_out() -> None:

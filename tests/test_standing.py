@@ -213,10 +213,10 @@ def test_size_error_does_not_average_out() -> None:
             times = dict.fromkeys(("t_source_ns", "t_capture_ns", "t_utc_ns"), k * 100_000_000)
             m = Measurements(frame_id=k, **times, cc=step if k else None, cv=cv, vv=(), cp=())
             estimate = graph.optimise(m)
-        in_ego = graph.vehicles_in_ego()
-        errors = [np.array([T.x_m, T.y_m]) - at[v] + [frames - 1, 0.0] for v, (T, _) in in_ego.items()]
-        pairs = zip(errors, in_ego.values(), strict=True)
-        of_place = np.mean([e @ np.linalg.solve(P[:2, :2], e) for e, (_, P) in pairs]) / 2.0
+        places_m = [(v.T_world_vehicle.x_m, v.T_world_vehicle.y_m) for v in estimate.vehicles]
+        errors = [np.array(place) - at[v.vehicle] for place, v in zip(places_m, estimate.vehicles, strict=True)]
+        covs = [np.reshape(v.cov, (3, 3))[:2, :2] for v in estimate.vehicles]
+        of_place = np.mean([e @ np.linalg.solve(P, e) for e, P in zip(errors, covs, strict=True)]) / 2.0
         of_velocity = np.mean([v.velocity_mps[0] ** 2 / v.velocity_cov[0] for v in estimate.vehicles])
         nees[stated] = of_place, of_velocity
     assert 0.2 < nees[sigma][0] < 1.2  # along the line of sight alone something is off

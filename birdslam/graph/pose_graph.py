@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import cmath
 import math
 from collections.abc import Sequence
 
@@ -29,7 +28,6 @@ from birdslam.graph.graph_config import GraphConfig, check_together
 from birdslam.graph.marginals import vehicle_estimates
 from birdslam.graph.minimum import minimise, solver
 from birdslam.graph.pending_map import PendingMap
-from birdslam.graph.state_layout import POSE
 from birdslam.graph.vehicles import MIN_INTERVAL_S, VehicleNodes, cv_edges
 from birdslam.graph.weights import WeightsConfig, weighted
 from birdslam.graph.window import Window
@@ -37,7 +35,6 @@ from birdslam.lanes.occupancy import with_users
 from birdslam.lanes.traffic import Traffic, initial_state
 from birdslam.types import (
     INVALIDATING,
-    BodyId,
     Estimate,
     FollowedPerson,
     Lanes,
@@ -119,23 +116,6 @@ class PoseGraph:
         if m.road_lanes is not None:
             estimate = msgspec.structs.replace(estimate, lanes=self._lanes(m.road_lanes, window, vehicles))
         return with_camera_scale(estimate, self._camera_sigma_rel)
-
-    def vehicles_in_ego(self) -> dict[BodyId, tuple[SE2, Floats]]:
-        """Returns T_ego_vehicle with its covariance (3, 3) in ego, for the vehicles detected in the newest frame.
-
-        Unlike the covariances of an estimate, it does not include the ego's error in world.
-        """
-        window, out = self.window, {}
-        if window is None:
-            return {}
-        covs = window.each_vehicle[:, POSE, POSE]
-        for row, v in enumerate(self._vehicles.nodes):
-            if v.seen_ns == self._t_ns:
-                at, yaw_rad = complex(window.at[window.nodes + row]), cmath.phase(window.heading[window.nodes + row])
-                by_size = v.size_bias_rel * np.array([at.real, at.imag, 0.0])  # see marginals.py
-                cov = covs[row] + np.outer(by_size, by_size)
-                out[v.vehicle] = SE2(at.real, at.imag, yaw_rad), cov
-        return out
 
     def map_update(self) -> MapUpdate | None:
         """Returns the additions to the map since the last call, in world; None if there are none."""
