@@ -1,4 +1,4 @@
-"""`birdslam evaluate odometry` and `evaluate car-ahead`: compare the method with true poses and with LiDAR."""
+"""`birdslam evaluate odometry`: compares the method with true poses, and with LiDAR."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Sequence
 from typing import Any, cast
 
+from birdslam.bench.ego.car_ahead import CarAheadReport
 from birdslam.bench.ego.trajectory_errors import OdometryReport
 from birdslam.runtime.cli.arguments import add_config, add_other_odometry, add_pipeline, add_speeds, add_topics
 from birdslam.runtime.configuration import ConfigurationError
@@ -27,36 +28,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Prints a table of trajectory errors."""
-    print(_table(_evaluate(options)))
-    return 0
-
-
-def run_car_ahead(options: argparse.Namespace) -> int:
-    """Prints the error of the distance to the car ahead from LiDAR, a line per sequence."""
-    for report in _evaluate(options):
-        ahead = report.car_ahead
-        if ahead is None:
-            raise ConfigurationError(f"{report.sequence}: has no LiDAR; expected lidar_cam0 beside its images")
-        if ahead.error_median_rel is None or ahead.error_p90_rel is None or ahead.bias_median_rel is None:
-            print(f"{report.sequence}: no car ahead in {report.frames} frames")
-        else:
-            print(
-                f"{report.sequence}: {ahead.frames} frames with a car ahead, distance error: "
-                f"median {ahead.error_median_rel:.1%}, 90 % within {ahead.error_p90_rel:.1%}, "
-                f"bias {ahead.bias_median_rel:+.1%}"
-            )
-    return 0
-
-
-def _evaluate(options: argparse.Namespace) -> list[OdometryReport]:
+    """Prints a table of trajectory errors, and the error of the distance to the car ahead where there is LiDAR."""
     configuration = configuration_of(options)
     compared = _frames(options.frames)
     if not configuration.models.in_use():
         print(WITHOUT_MODELS)
     reports = evaluate_odometry(configuration, options.sequences, compared)
     print(f"results in {configuration.output}")
-    return reports
+    print(_table(reports))
+    for report in reports:
+        if report.car_ahead is not None and report.car_ahead.error_median_rel is not None:
+            print(f"{report.sequence}: {_ahead(report.car_ahead)}")
+    return 0
+
+
+def _ahead(ahead: CarAheadReport) -> str:
+    return (
+        f"{ahead.frames} frames with a car ahead, distance error: median {ahead.error_median_rel:.1%}, "
+        f"90 % within {ahead.error_p90_rel:.1%}, bias {ahead.bias_median_rel:+.1%}"
+    )
 
 
 def _frames(text: str) -> slice:
