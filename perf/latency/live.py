@@ -37,7 +37,6 @@ class Ask(msgspec.Struct, frozen=True, kw_only=True):
     models: tuple[str, ...] = ()  # ROLE=PATH
     settings: tuple[str, ...] = ()  # KEY=VALUE
     config: str = ""  # a file
-    planners: int = 0  # number of additional planners
 
     def command(self, place: Path) -> list[str]:
         """The command line of `birdslam`, with all its files under `place`."""
@@ -98,10 +97,9 @@ def drive(ask: Ask) -> Iterator[Run]:
         with log.open("wb") as output:
             process = subprocess.Popen(ask.command(run.place), stdout=output, stderr=output, start_new_session=True)
         try:
-            with _planners(ask.planners, run.place / "rt"):
-                with contextlib.suppress(KeyboardInterrupt):
-                    run.complete = _receive(run, process)
-                _finish(process, run.complete)
+            with contextlib.suppress(KeyboardInterrupt):
+                run.complete = _receive(run, process)
+            _finish(process, run.complete)
         finally:
             if process.poll() is None:
                 process.kill()
@@ -149,22 +147,6 @@ def _sample(pid: int, now_s: float, with_pss: bool) -> Sample:
                 if with_pss:  # slow: the kernel walks all pages
                     sample.pss_mb[name] = process.memory_full_info().pss / 2**20
     return sample
-
-
-@contextlib.contextmanager
-def _planners(count: int, runtime_dir: Path) -> Iterator[None]:
-    """Additional planners in separate processes, which receive all estimates."""
-    command = birdslam_command("listen", "--vehicle", _VEHICLE, "--runtime-dir", str(runtime_dir))
-    others = [
-        subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
-        for _ in range(count)
-    ]
-    try:
-        yield
-    finally:
-        for other in others:
-            other.kill()
-            other.wait()
 
 
 def add_run_options(add: Any) -> None:

@@ -37,7 +37,6 @@ def run(arguments: list[str]) -> int:
     parser.add_argument("--rate", type=float, default=33.0, help="Hz")
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--load", type=int, default=0, help="number of cores loaded by other processes")
-    parser.add_argument("--planners", type=int, default=0, help="number of additional planners")
     options = parser.parse_args(arguments)
     ask = Ask(
         source=options.source,
@@ -46,7 +45,6 @@ def run(arguments: list[str]) -> int:
         models=tuple(options.model),
         settings=tuple(options.set),
         config=options.config,
-        planners=options.planners,
     )
     settings = {**msgspec.to_builtins(ask, enc_hook=str), "seconds": options.seconds, "load": options.load}
     with Ledger(options.output, label, **settings) as ledger:

@@ -41,7 +41,6 @@ class Step:
 STEPS = (
     Step("system", "system", "--seconds 120", "--seconds 600", on_source=True),
     Step("system-loaded", "system", "--seconds 60 --load 1", "--seconds 120 --load 1", on_source=True),
-    Step("system-planners", "system", "--seconds 10 --planners 4", "--seconds 60 --planners 4", on_source=True),
     Step(
         "optimizer",
         "optimizer",
