@@ -1,10 +1,9 @@
 """Runs all benchmarks, each in a fresh process, and writes a short report.
 
-    python -m perf all --output DIR [--source URI] [--model ROLE=PATH]... [--thorough]
+    python -m perf all --output DIR [--source URI] [--model ROLE=PATH]...
 
 The default source is the shipped drive with the shipped network. DIR gets the JSON of each benchmark, and report.md has
-what they print. After Ctrl-C the report has the results so far and names the missing ones. Takes about 20 minutes
-without `--thorough`.
+what they print. After Ctrl-C the report has the results so far and names the missing ones. Takes about 20 minutes.
 """
 
 from __future__ import annotations
@@ -29,26 +28,24 @@ END_S = 60.0  # time for a benchmark to save its results
 
 @dataclass(frozen=True)
 class Step:
-    """One benchmark with its options for a quick and for a thorough run."""
+    """One benchmark with its options."""
 
     file: str
     benchmark: str
-    quick: str
-    thorough: str
+    options: str
     on_source: bool = False
 
 
 STEPS = (
-    Step("system", "system", "--seconds 120", "--seconds 600", on_source=True),
-    Step("system-loaded", "system", "--seconds 60 --load 1", "--seconds 120 --load 1", on_source=True),
+    Step("system", "system", "--seconds 120", on_source=True),
+    Step("system-loaded", "system", "--seconds 60 --load 1", on_source=True),
     Step(
         "optimizer",
         "optimizer",
         "--frames 10000 --vehicles 0,5,10,15 --limit-s 15 --contenders ours,isam2,incremental_fixed_lag_qr",
-        "--frames 10000 --limit-s 60",
     ),
-    Step("batch", "optimizer", "--batch 200", "--batch 50,100,200,414"),
-    Step("transport", "transport", "--seconds 0.8", "--seconds 10"),
+    Step("batch", "optimizer", "--batch 200"),
+    Step("transport", "transport", "--seconds 0.8"),
 )
 
 
@@ -57,7 +54,6 @@ def run(arguments: list[str]) -> int:
     parser.add_argument("--output", type=Path, required=True, metavar="DIR")
     parser.add_argument("--source", default="demo", metavar="URI", help="default: demo, the shipped drive")
     parser.add_argument("--model", action="append", default=[], metavar="ROLE=PATH", help="default: the shipped one")
-    parser.add_argument("--thorough", action="store_true", help="longer runs, for publication")
     parser.add_argument("--only", default="", help="a list of steps: " + ",".join(step.file for step in STEPS))
     options = parser.parse_args(arguments)
     only = options.only.split(",") if options.only else [step.file for step in STEPS]
@@ -87,7 +83,7 @@ def run_step(step: Step, options: argparse.Namespace) -> tuple[str, str]:
     file = options.output / f"{step.file}.json"
     file.unlink(missing_ok=True)
     command = [sys.executable, "-m", "birdslam.perf", step.benchmark, "--output", str(file)]
-    command += shlex.split(step.thorough if options.thorough else step.quick)
+    command += shlex.split(step.options)
     if step.on_source:
         command += ["--source", options.source, *(part for model in options.model for part in ("--model", model))]
     printed = []
