@@ -1,4 +1,4 @@
-"""Consistency of the scale of one video at other sizes and rates, with noise, and with later starts.
+"""Consistency of the scale of one video at other sizes and rates, and with later starts.
 
     python -m perf films [FILM ...] [--part PART ...] [--seconds S] [--begin-at S ...] [--output FILE.json] [--data DIR]
                          [--networks] [--model ROLE=PATH ...]

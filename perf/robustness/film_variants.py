@@ -1,8 +1,8 @@
-"""Variants of a film: other sizes and rates, and invisible noise."""
+"""Variants of a film: other sizes and rates."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -13,7 +13,6 @@ from birdslam.geometry.arrays import Image
 from birdslam.geometry.camera import Camera
 
 Timed = tuple[int, Image]  # t_source_ns, the raw image
-Change = Callable[[int, Image], Image]  # (index of an image, image)
 
 MIN_WIDTH_PX, MAX_WIDTH_PX = 320, 3840
 
@@ -25,7 +24,6 @@ class Variant:
     name: str
     size: float = 1.0
     every: int = 1  # use only each n-th image
-    shown: Change | None = None
 
     def camera(self, camera: Camera) -> Camera:
         """The camera of the changed images; `camera` is that of the original film."""
@@ -52,8 +50,6 @@ class Variant:
         for k, (t_ns, image) in enumerate(film):
             if k % self.every:
                 continue
-            if self.shown is not None:
-                image = self.shown(k, image)
             if self.size != 1.0:
                 size = round(image.shape[1] * self.size), round(image.shape[0] * self.size)
                 how = cv2.INTER_AREA if self.size < 1.0 else cv2.INTER_CUBIC
@@ -61,9 +57,8 @@ class Variant:
             yield t_ns, image
 
 
-PARTS = ("starts", "sizes", "noise")
+PARTS = ("starts", "sizes")
 _SIZES, _EVERY = (1.0, 0.5, 0.75, 2.0), (1, 2, 3)
-_NOISE_GREY, _DRAWS = 1.5, 5  # 1-sigma of invisible noise; number of draws
 
 
 def variants(camera: Camera, part: str) -> list[Variant]:
@@ -71,7 +66,6 @@ def variants(camera: Camera, part: str) -> list[Variant]:
     every = {
         "starts": [_other(1.0, 1), _other(0.5, 1), _other(1.0, 2), _other(1.0, 3)],
         "sizes": [_other(size, n) for size in _SIZES for n in _EVERY],
-        "noise": [Variant("unchanged"), *(Variant(f"noise, draw {n}", shown=_noise(n)) for n in range(1, _DRAWS + 1))],
     }[part]
     return [variant for variant in every if variant.fits(camera)]
 
@@ -79,13 +73,3 @@ def variants(camera: Camera, part: str) -> list[Variant]:
 def _other(size: float, every: int) -> Variant:
     parts = [f"{size:g} of the size"] * (size != 1.0) + [f"every {every} images"] * (every != 1)
     return Variant(", ".join(parts) or "unchanged", size=size, every=every)
-
-
-def _noise(draw: int) -> Change:
-    """Invisible noise; the resulting differences are the significance threshold of all others."""
-
-    def noisy(index: int, image: Image) -> Image:
-        added = np.random.default_rng((draw, index)).normal(0.0, _NOISE_GREY, image.shape)
-        return np.clip(np.rint(image + added), 0, 255).astype(np.uint8)
-
-    return noisy
