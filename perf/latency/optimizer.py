@@ -38,7 +38,7 @@ from birdslam.perf.latency.smoothers import Smoother
 from birdslam.perf.reporting.arguments import benchmark_parser, numbers
 from birdslam.perf.reporting.figures import Ledger, spread
 from birdslam.perf.reporting.machine import Steal
-from birdslam.types import FIRST_PERSON, FollowedPerson, Measurements
+from birdslam.types import Measurements
 
 label = "the pose graph's update compared with gtsam's smoothers"
 
@@ -57,7 +57,6 @@ _LAG_FRAMES = GraphConfig().ego_nodes
 def run(arguments: list[str]) -> None:
     parser = benchmark_parser("optimizer", label)
     parser.add_argument("--vehicles", default="0,1,3,6,10,15", help="list of numbers of visible vehicles")
-    parser.add_argument("--people", type=int, default=0, help="number of tracked people, for `ours` and `ours_live`")
     parser.add_argument("--frames", type=int, default=10_000)
     parser.add_argument("--contenders", default=",".join(CONTENDERS), help="a list")
     parser.add_argument("--limit-s", type=float, default=60.0, help="time for each contender's frames")
@@ -75,30 +74,17 @@ def run(arguments: list[str]) -> None:
         for vehicles in (int(n) for n in options.vehicles.split(",")):
             log = Path(folder) / f"{vehicles}.log"
             config = DriveConfig(frames=options.frames, vehicles=vehicles, traffic="convoy")
-            write_log(log, config, options.seed, options.people)
+            write_log(log, config, options.seed)
             for contender in options.contenders.split(","):
                 row = measure(contender, vehicles, log, options.limit_s)
-                name = f"{contender} {vehicles} vehicles" + (f" {options.people} people" if options.people else "")
-                ledger.add(name, summary(row), **row)
+                ledger.add(f"{contender} {vehicles} vehicles", summary(row), **row)
 
 
-def write_log(log: Path, config: DriveConfig, seed: int, people: int = 0) -> None:
+def write_log(log: Path, config: DriveConfig, seed: int) -> None:
     """Writes the log that all contenders use."""
-    crowd = tuple(_walker(k) for k in range(people))
     everything = drive(config, seed).measurements
-    with_key_frames = (
-        replace(m, people=crowd) if k % _LAG_FRAMES == 0 else replace(m, cp=(), people=crowd)
-        for k, m in enumerate(everything)
-    )
+    with_key_frames = (m if k % _LAG_FRAMES == 0 else replace(m, cp=()) for k, m in enumerate(everything))
     log.write_bytes(msgspec.msgpack.encode([msgspec.msgpack.encode(m) for m in with_key_frames]))
-
-
-def _walker(number: int) -> FollowedPerson:
-    cov = (0.4, 0.01, 0.01, 0.05)
-    x_m, y_m = 5.0 + 0.5 * number, (-1.0) ** number * 4.0
-    return FollowedPerson(
-        person=FIRST_PERSON + number, x_m=x_m, y_m=y_m, cov=cov, vx_mps=0.3, vy_mps=-1.2, velocity_cov=cov
-    )
 
 
 def summary(row: dict[str, Any]) -> str:
