@@ -17,9 +17,8 @@ import tempfile
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +26,6 @@ import numpy as np
 import psutil
 from numpy.typing import ArrayLike
 
-from birdslam.geometry.arrays import Floats
 from birdslam.loops.map_file import MapError
 from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.robustness.faulty_vehicle import Vehicle, exit_on_sigterm, model_options, record_options
@@ -124,25 +122,8 @@ class Ages:
     driven_ns: int = 0
 
 
-def slope(t_s: ArrayLike, values: ArrayLike, of: Callable[[Floats], float] = np.mean) -> tuple[float, float]:
-    """Slope of a series per hour, and its sigma; NaN if the series is too short.
-
-    Fits a line through the means (or another statistic) of blocks, which are nearly independent, unlike samples. The
-    sigma follows from the residuals of the blocks.
-    """
-    t, y = np.asarray(t_s, dtype=np.float64) / 3600.0, np.asarray(values, dtype=np.float64)
-    if t.size < 2 * BLOCKS:
-        return float("nan"), float("nan")
-    x = np.array([block.mean() for block in np.array_split(t, BLOCKS)])
-    z = np.array([of(block) for block in np.array_split(y, BLOCKS)])
-    x -= x.mean()
-    gain = float(x @ z / (x @ x))
-    left = z - z.mean() - gain * x
-    return gain, float(np.sqrt(left @ left / (BLOCKS - 2) / (x @ x)))
-
-
 def drift(t_s: ArrayLike, values: ArrayLike) -> tuple[float, float]:
-    """Growth per hour of a series that rises in steps, such as memory, and its sigma; NaN if the series is too short.
+    """Growth per hour of a series that may rise in steps, and its sigma; NaN if the series is too short.
 
     The gains of blocks are independent, residuals of a line are not. A single step is one sigma.
     """
@@ -189,9 +170,7 @@ def ages(found: Ages) -> tuple[str, list[str]]:
     p50, p99 = np.percentile(found.ms[:quarter], (50, 99))
     end_p50, end_p99 = np.percentile(found.ms[-quarter:], (50, 99))
     text = f"age at the planner, first quarter p50 {p50:.1f}, p99 {p99:.1f} ms; last {end_p50:.1f}, {end_p99:.1f} ms"
-    for percent in (50, 99):
-        gain, sigma = slope(found.t_s, found.ms, partial(np.percentile, q=percent))
-        text += f"; p{percent} {gain:+.1f} +- {sigma:.1f} ms an hour"
+    text += "; p50 {:+.1f} +- {:.1f} ms an hour".format(*drift(found.t_s, found.ms))
     grew = end_p50 > (1.0 + AGE_GROWTH) * p50
     return text, [f"the median age grew from {p50:.1f} to {end_p50:.1f} ms"] if grew else []
 
@@ -224,7 +203,7 @@ def table(series: Mapping[str, Series], summary: dict[str, Any], systemd: System
     lines = ["| process | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
     for name, one in series.items():
         before, after = one.ends()
-        mib, descriptors = drift(one.t_s, one.mib), slope(one.t_s, one.descriptors)
+        mib, descriptors = drift(one.t_s, one.mib), drift(one.t_s, one.descriptors)
         cells = (
             *(f"{before:.1f}", f"{after:.1f}", f"{one.growth:+.2%}", "{:+.2f} +- {:.2f}".format(*mib)),
             "{:+.1%} +- {:.1%}".format(*one.in_a_shift()),
