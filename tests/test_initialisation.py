@@ -14,7 +14,7 @@ from birdslam.odometry.corners.initialisation import InitialisationConfig, Motio
 from birdslam.odometry.corners.two_view import initial_two_view, two_view_from_prior
 from birdslam.odometry.odometry import Odometry
 from birdslam.odometry.road.alignment import RoadAlignConfig, RoadAligner
-from birdslam.odometry.road.scale_search import best_length, explained_by_motion
+from birdslam.odometry.road.scale_likelihood import best_length, explained_by_motion
 from birdslam.perf.accuracy.drives import errors, follow, read
 from birdslam.sources.opening import open_recording
 from birdslam.types import Status

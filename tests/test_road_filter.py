@@ -13,7 +13,6 @@ from birdslam.geometry.pose import Pose, rotation_exp
 from birdslam.odometry.road.alignment import RoadAlignConfig, RoadAligner
 from birdslam.odometry.road.fit import RoadFit
 from birdslam.odometry.road.kalman_filter import RoadFilter
-from birdslam.odometry.road.scale_confirmation import ScaleConfirmation
 from birdslam.odometry.scale_config import RoadScaleConfig
 from tests.graded_road import CURVE_M, GradedRoad, Stand
 
@@ -187,54 +186,3 @@ def test_scale_drift_does_not_tilt_the_road() -> None:
     without = pitch_under_drift(RoadScaleConfig(scale_drift_per_m=1e-9))
     assert without > 0.004
     assert pitch_under_drift(RoadScaleConfig()) < without / 3.0
-
-
-@pytest.mark.parametrize(("agreed", "needed"), [(1, 1), (5, 5), (40, 10)])
-def test_new_scale_must_outweigh_earlier_agreement(agreed: int, needed: int) -> None:
-    confirmation = ScaleConfirmation(RoadScaleConfig())
-    for _ in range(agreed):
-        confirmation.confirm(1.0, 0.01)
-        assert not confirmation.is_outweighed
-    confirmation.confirm(1.0, math.log(0.2))
-    count = 1
-    while confirmation.is_outweighed:
-        confirmation.confirm(1.0, 0.0)
-        count += 1
-    assert count == needed
-
-
-def test_weak_comparison_counts_with_two_agreeing_ones() -> None:
-    confirmation = ScaleConfirmation(RoadScaleConfig())
-    confirmation.reject(1.0, 3.4)
-    confirmation.reject(1.0)
-    confirmation.reject(1.0, 0.3)
-    assert not confirmation.was_found_before(3.45)
-    confirmation.reject(1.0, 3.5)
-    assert confirmation.was_found_before(3.45)
-    assert not confirmation.was_found_before(0.3)
-    confirmation.add_accepted(1.0)
-    assert not confirmation.was_found_before(3.45)
-
-
-def test_each_alignment_without_information_tries_another_baseline() -> None:
-    confirmation = ScaleConfirmation(RoadScaleConfig())
-    confirmation.reject(1.0)
-    confirmation.add_accepted(0.1)
-    confirmation.add_accepted(0.0)
-    assert confirmation.uninformative == 3
-    confirmation.add_accepted(0.9)
-    assert confirmation.uninformative == 0
-
-
-def test_known_scale_yields_to_two_agreeing_searches() -> None:
-    """The town film at half size from its 13th second on grew by 30 % at one comparison that correlated by .33."""
-    confirmation = ScaleConfirmation(RoadScaleConfig())
-    assert confirmation.is_plausible(0.3)  # nothing is known
-    for _ in range(3):
-        confirmation.confirm(1.0, 0.01)
-    for _ in range(2):
-        assert not confirmation.is_plausible(0.3)
-        confirmation.reject(1.0, 0.3)
-    assert confirmation.is_plausible(0.3)
-    assert not confirmation.is_plausible(-0.3)
-    assert confirmation.is_plausible(0.05)  # it is the known one

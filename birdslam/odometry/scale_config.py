@@ -33,7 +33,6 @@ class RoadScaleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # of the two images of the road; an alignment with less is rejected
     min_correlation: Annotated[float, msgspec.Meta(gt=0.0, lt=1.0)] = 0.35
     max_innovation_sigma: Positive = 4.0  # gate of an alignment
-    confirmations: Annotated[int, msgspec.Meta(ge=1)] = 3  # consecutive alignments until the scale is known
     doubt_sigma_rel: Positive = 0.15  # above this the length is searched globally
     doubt_after: Annotated[int, msgspec.Meta(ge=1)] = 3  # consecutive rejected alignments that trigger the search
     violated_after: Annotated[int, msgspec.Meta(ge=1)] = 5  # consecutive rejected alignments until ground_violated
@@ -66,6 +65,7 @@ class RoadScaleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     car: CarSpeedConfig = CarSpeedConfig()
     # mode "paper" only
     median_frames: Annotated[int, msgspec.Meta(ge=1)] = 21  # window of the moving median; the paper states none
+    confirmations: Annotated[int, msgspec.Meta(ge=1)] = 3  # frames with a scale until it is known
     median_landmarks: Annotated[int, msgspec.Meta(ge=1)] = 3  # minimum landmarks on the road for the scale of a frame
     median_range_m: Positive = 20.0  # maximum depth of those landmarks, the paper's threshold T
     median_sigma_depth_rel: Positive = 0.1  # maximum 1-sigma of the depth of those landmarks

@@ -1,8 +1,8 @@
 """Initial motion between two images without a motion model, at the start and after a loss of tracking.
 
 Rotation: blocks above the horizon of the cylindrical projection vote for yaw and pitch by normalised cross-correlation.
-Length: regression of the road's image over distance and pitch (road/scale_search.py); the direction follows from the
-rotation about the rear axle.
+Length: regression of the road's image over distance and pitch (road/scale_likelihood.py); the direction follows from
+the rotation about the rear axle.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import Pose, rotation_exp
 from birdslam.odometry.road.alignment import RoadAligner
 from birdslam.odometry.road.road_image import RoadImage
-from birdslam.odometry.road.scale_search import best_length, explained_by_motion
+from birdslam.odometry.road.scale_likelihood import best_length, explained_by_motion
 
 Floats = NDArray[np.float64]
 Grey = NDArray[np.float32]
