@@ -2,13 +2,15 @@
 takes the cores of all that follows.
 
 `python -S leftovers.py PID MARK` waits until process PID is gone, and then kills every process whose environment has
-BIRDSLAM_TESTS=MARK.
+MARK in BIRDSLAM_TESTS. A process that was itself started by tests (a worker of pytest-xdist) appends its mark: its own
+watcher has the mark of the outer process, and is killed with it.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
+import re
 import select
 import signal
 import sys
@@ -23,15 +25,17 @@ def end_with_this_process() -> int:
     command = [sys.executable, "-S", __file__, str(os.getpid()), mark]
     nowhere = [(os.POSIX_SPAWN_OPEN, fd, os.devnull, os.O_RDWR, 0) for fd in range(3)]
     watcher = os.posix_spawn(sys.executable, command, os.environ, file_actions=nowhere, setsid=True)
-    os.environ[VARIABLE] = mark  # after it: it outlives what it kills
+    outer = os.environ.get(VARIABLE)
+    os.environ[VARIABLE] = f"{outer},{mark}" if outer else mark  # after the watcher, which outlives what it kills
     return watcher
 
 
 def _marked(mark: str) -> list[int]:
+    pattern = re.compile(rf"(?:^|\0){VARIABLE}=(?:[^\0]*,)?{mark}[,\0]".encode())
     found = []
     for place in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):  # it has just ended, or is another user's
-            if f"{VARIABLE}={mark}".encode() in (place / "environ").read_bytes().split(b"\0"):
+            if pattern.search((place / "environ").read_bytes()):
                 found.append(int(place.name))
     return found
 

@@ -22,6 +22,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from tests.leftovers import end_with_this_process
+
 ON_EACH_CHANGE = "not slow and not faults and not onroad"
 COMPUTING = f"not processes and {ON_EACH_CHANGE}"
 ON_EACH_CPU = "not processes and not faults and not onroad and (not slow or numeric)"  # with the statistics of starts
@@ -118,6 +120,7 @@ def main() -> int:
     )
     parser.add_argument("--sample", action="store_true", help="two variants, and the tests marked `numeric`")
     options = parser.parse_args()
+    end_with_this_process()
     if options.sample:
         return under_variants(SAMPLE, f"numeric and {COMPUTING}")
     if options.cpus is not None:
