@@ -22,5 +22,5 @@ def foreign_session(base: Path, vehicle: str = "car", as_hub: bool = False) -> I
 
 def matched(publisher: zenoh.Publisher) -> bool:
     """Whether somebody subscribes to what it sends; before that, all is lost."""
-    status: zenoh.MatchingStatus = publisher.matching_status  # type: ignore[assignment]
+    status: zenoh.MatchingStatus = publisher.matching_status
     return status.matching

@@ -161,7 +161,7 @@ def subscribers() -> Iterator[Target]:
     session, ends = Undeclared(), {}
     goods = {type(example): encode(example) for example in EXAMPLES}
     for name, topic in TOPICS.items():
-        ends[name] = Subscriber(session, key_of("car", name), topic, 2, False)  # type: ignore[arg-type]
+        ends[name] = Subscriber(session, key_of("car", name), topic, 2, False)
 
     def target(chance: Chance) -> bool:
         name = chance.choice(sorted(TOPICS))
@@ -178,7 +178,6 @@ def subscribers() -> Iterator[Target]:
         if subscriber.malformed > before[0]:
             assert subscriber.newest is before[1], "a refused message was kept"
             return False
-        assert subscriber.newest is not None
         record = subscriber.newest.record
         encode(record)
         if name == "estimate":
@@ -252,7 +251,7 @@ def optimizer() -> Target:
             **{"cp": [[landmark, frame, *rest]]},
         }
         if chance.random() < 0.6:
-            plain = with_other_fields(chance, plain)  # type: ignore[assignment]
+            plain = with_other_fields(chance, plain)
         try:
             measurements = decode(msgpack.packb(plain), Measurements)
         except WireError:
@@ -481,7 +480,7 @@ def targets(folder: Path) -> Iterator[tuple[str, float, Callable[[], object]]]:
     yield "bags", 0.005, lambda: bags(folder)
     for name, share, goods, read, refusal in readers():
         make = files(goods, read, refusal)
-        yield name, share, lambda make=make: make(folder)  # type: ignore[misc]
+        yield name, share, lambda make=make: make(folder)
 
 
 @dataclass(frozen=True)
@@ -504,7 +503,7 @@ def run(cases: int, seed: int, only: Container[str] | None = None) -> Iterator[C
             chance, begun_s, let_in = Chance(f"{seed} {name}"), time.monotonic(), 0
             number, slowest_s, last_s = round(cases * share / shares), 0.0, begun_s
             made = make()
-            with made if hasattr(made, "__enter__") else _open(made) as target:  # type: ignore[attr-defined]
+            with made if hasattr(made, "__enter__") else _open(made) as target:
                 for case in range(number):
                     try:
                         let_in += target(chance)

@@ -147,7 +147,6 @@ def car(port: int, domain: int, uri: str, rate_hz: float) -> None:
             send("/fix", header=header, latitude=49.0 + 1e-6 * number, longitude=8.4, altitude=math.nan)
         forward = make("geometry_msgs/msg/Twist", linear=parts.vector(SPEED_MPS, 0.0, 0.0))
         send("/wheels", header=header, twist=forward)
-        assert frame.image is not None
         height_px, width_px, *colours = frame.image.shape
         send(
             IMAGE, header=header, height=height_px, width=width_px, step=frame.image.strides[0],

@@ -24,7 +24,6 @@ def peer(*arguments: str) -> Iterator[subprocess.Popen[str]]:
     command = [sys.executable, "-m", PEER, *arguments]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         try:
-            assert process.stdout is not None
             assert process.stdout.readline().strip() == "ready", f"{PEER} {arguments[0]} did not start"
             yield process
         finally:

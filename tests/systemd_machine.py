@@ -107,7 +107,6 @@ class Machine:
     def __init__(self, place: Path) -> None:
         self._place = place
         cgroup2 = _cgroup2()
-        assert cgroup2 is not None
         self._cgroup = cgroup2 / f"birdslam-test-{os.getpid()}"
         self._process: subprocess.Popen[bytes] | None = None
         self._pid1 = 0
@@ -144,7 +143,6 @@ class Machine:
         return self
 
     def _booted(self) -> bool:
-        assert self._process is not None
         if self._process.poll() is not None:
             raise AssertionError(f"the machine did not boot: {Path(self._log.name).read_text()}")
         children = Path(f"/proc/{self._process.pid}/task/{self._process.pid}/children").read_text().split()

@@ -82,7 +82,7 @@ class Tape:
     def _begin(self, assignment: Assignment) -> None:
         self.writer.draw("/alive", Alive(node="optimize", alive=True), self.tick())
         self._sent = 0
-        self.node = OptimizeNode(self.configuration, self.perceive, assignment)  # type: ignore[arg-type]
+        self.node = OptimizeNode(self.configuration, self.perceive, assignment)
 
     def tick(self) -> int:
         self._now_ns += 1_000_000
@@ -141,7 +141,7 @@ class Tape:
         if noticed:
             self._begin(assignment)
         else:
-            self.node = OptimizeNode(self.configuration, self.perceive, assignment)  # type: ignore[arg-type]
+            self.node = OptimizeNode(self.configuration, self.perceive, assignment)
         while (message := self.node.receive(0.0)) is not None:
             self.take(message)
 

@@ -23,7 +23,6 @@ def known(method: Live) -> tuple[Floats, Floats]:
     graph = PoseGraph(method.graph, method.weights)
     estimates = [graph.optimise(method.reweighed(m)) for m in WORLD.measurements]
     window = graph.window
-    assert window is not None
     vehicles = [window.P[np.ix_(rows, rows)] for rows in window.layout.poses]
     return np.array([np.reshape(e.cov, (3, 3)) for e in estimates]), np.array(vehicles)
 

@@ -55,7 +55,7 @@ def worst_m(world: Drive, result: Trajectories) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("method", [nair, batch_se3], ids=lambda module: module.__name__)
-def test_a_world_without_noise_is_recovered(world: Drive, method) -> None:  # type: ignore[no-untyped-def]
+def test_a_world_without_noise_is_recovered(world: Drive, method) -> None:
     result = method.run(world.measurements, CAMERA)
     assert set(result.ego) == set(range(QUIET.frames))
     assert {(v, f) for v, poses in result.vehicles.items() for f in poses} == {

@@ -157,7 +157,6 @@ def test_the_first_frames_of_a_drive_are_compared_with_the_truth(tmp_path: Path)
     assert told[-1] == (4, 4)
     result = msgspec.json.decode((tmp_path / "out" / DRIVES / "00" / "result.json").read_bytes(), type=DriveResult)
     assert result.frames == 4
-    assert result.truth is not None
     assert result.truth.ate_m is not None
 
 
@@ -240,7 +239,7 @@ def test_killed_process_fails_only_its_drive(tmp_path: Path, monkeypatch: pytest
         if not started:
             command = [sys.executable, "-c", "import os, signal; os.kill(os.getpid(), signal.SIGKILL)"]
         started.append(command)
-        return start(command, **options)  # type: ignore[call-overload,no-any-return]
+        return start(command, **options)
 
     started: list[list[str]] = []
     monkeypatch.setattr(subprocess, "Popen", killed)

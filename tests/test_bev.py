@@ -16,7 +16,7 @@ grounds = st.builds(GroundPlane, st.floats(0.5, 3.0), st.floats(-0.1, 0.1), st.f
 
 
 def camera(**changes: object) -> Camera:
-    return Camera(**{**KITTI_LIKE, "height_m": 1.65, **changes})  # type: ignore[arg-type]
+    return Camera(**{**KITTI_LIKE, "height_m": 1.65, **changes})
 
 
 @given(grounds, st.floats(3.0, 60.0), st.floats(-1.0, 1.0))

@@ -47,7 +47,6 @@ SHIFTED_RIGHT = (704.0, 182.0, 786.0, 241.0)
 def test_each_box_has_the_body_of_the_box_that_overlaps_it_most() -> None:
     theirs = embodied(boxes(RIGHT, LEFT), [20.0, 25.0])
     found = with_bodies(boxes(LEFT, SHIFTED_RIGHT), theirs)
-    assert found.boxes3d is not None
     assert found.boxes3d.depth_m.tolist() == [25.0, 20.0]
     assert found.boxes_px.tolist() == [list(LEFT), list(SHIFTED_RIGHT)]  # the boxes stay the detector's
     assert with_bodies(theirs, embodied(boxes(LEFT), [9.0])) is theirs  # whose bodies are its own
@@ -63,7 +62,6 @@ def test_box_without_body_is_placed_by_its_edges() -> None:
     assert after.dimensions.length_m == before.dimensions.length_m
     assert after.dimensions.sigma_length_rel == pytest.approx(before.dimensions.sigma_length_rel)
     before, after, place = by_row[1]
-    assert place is not None
     assert place.centre_m[0] == pytest.approx(20.0, abs=0.5)
     assert after.dimensions.length_m > before.dimensions.length_m
 
@@ -84,13 +82,10 @@ def test_bodies_are_of_the_same_image() -> None:
     shipped = head("multitask", embodied(boxes(LEFT), [25.0]), every=2)
     networks = Networks([*heads, shipped], run_at_once, bodies=True)
     first, second = (networks.start(frame, IMAGE).result().detections for frame in (0, 1))
-    assert first is not None
     assert first.boxes3d is not None
-    assert second is not None
     assert second.boxes3d is None  # the multi-task network did not look
     assert shipped.runs == 1
     unasked = head("multitask", embodied(boxes(LEFT), [25.0]))
     plain = Networks([*heads, unasked], run_at_once).start(0, IMAGE).result().detections
-    assert plain is not None
     assert plain.boxes3d is None
     assert unasked.runs == 0

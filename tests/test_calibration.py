@@ -94,7 +94,6 @@ def test_a_chessboard_gives_the_lens(boards: Path) -> None:
     assert (lens.fx_px, lens.fy_px) == pytest.approx((520.0, 518.0), rel=0.01)
     assert (lens.cx_px, lens.cy_px) == pytest.approx((315.0, 236.0), abs=6.0)
     assert (lens.width_px, lens.height_px, len(lens.distortion)) == (640, 480, 5)
-    assert lens.reprojection_px is not None
     assert lens.reprojection_px < 0.3
 
 
@@ -147,7 +146,6 @@ def test_mount_from_vehicles_is_within_its_sigma(seed: int) -> None:
         boxes.append(BoxHeight(100 + len(boxes), -0.05, 0.002, 0.1, 0.002, 0.0, 1.53, 0.08))
     wide = np.diag([1.0, 0.1**2, 0.1**2])
     mounting = solve_mounting(boxes, np.array([1.65, 0.0, 0.0]), wide, VehicleHeightConfig())
-    assert mounting is not None
     assert np.sqrt(np.diag(mounting.cov)) == pytest.approx([0.11, 0.006, 0.05], rel=0.4)
     assert (np.abs(mounting.state - truth) < 2.5 * np.sqrt(np.diag(mounting.cov))).all()
     assert solve_mounting(boxes[:16], np.array([1.65, 0.0, 0.0]), wide, VehicleHeightConfig()) is None
@@ -165,7 +163,6 @@ def test_vehicles_on_a_slope_do_not_give_a_certain_roll(seed: int) -> None:
             bottom = ground_m / z + rng.normal(0, 0.002)
             boxes.append(BoxHeight(vehicle, bottom, 0.002, tall_m / z, 0.002, b, 1.53, 0.08))
     mounting = solve_mounting(boxes, np.array([1.4, 0.0, 0.0]), np.diag([0.4, 0.01, 0.01]), VehicleHeightConfig())
-    assert mounting is not None
     assert (np.abs(mounting.state - truth) < 2.5 * np.sqrt(np.diag(mounting.cov))).all()
 
 
@@ -185,7 +182,6 @@ def test_slow_passing_cars_do_not_outweigh_those_ahead(seed: int) -> None:
             bottom = truth_m / z + 0.07 * (b - 0.5) + rng.normal(0, 0.002)
             boxes.append(BoxHeight(vehicle, bottom, 0.002, 1.53 / z, 0.002, b, 1.53, 0.08))
     mounting = solve_mounting(boxes, np.array([1.5, 0.0, 0.0]), np.diag([0.5, 2e-5, 1e-4]), VehicleHeightConfig())
-    assert mounting is not None
     assert abs(mounting.state[0] - truth_m) < 1.5 * np.sqrt(mounting.cov[0, 0])
     assert abs(mounting.state[2]) < 0.03
 
@@ -200,7 +196,6 @@ def test_scale_error_does_not_average_out_over_comparisons() -> None:
     for count in (40, 400):
         seen = Observations(fits=[(RoadFit(np.array([0.0, pitch_rad, 0.0, 0.0]), cov, 0.9, 1000), 3.0)] * count)
         road = by_road(seen, CAMERA, CalibrationConfig())
-        assert road is not None
         sigmas.append(math.sqrt(road.cov[0]))
         assert abs(road.pitch_rad - 0.01) < 1.5 * sigmas[-1]
     assert sigmas[1] > 0.9 * sigmas[0]
@@ -379,7 +374,6 @@ def test_an_earlier_camera_file_keeps_the_sigma_of_its_distortion(tmp_path: Path
     path = tmp_path / "camera.toml"
     path.write_text(camera_text(msgspec.structs.replace(CAMERA, distortion_sigma=0.05), ()))
     lens, _ = lens_of(Given(camera=path), "demo", BagTopics())
-    assert lens is not None
     assert lens.distortion_sigma == 0.05
 
 

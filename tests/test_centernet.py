@@ -52,7 +52,7 @@ def maps(objects: list[tuple[int, tuple[float, float, float, float], float]]) ->
     return {"hm": heat, "wh": sizes, "reg": offsets}
 
 
-def load(tmp_path: Path, text: str, answers: dict[str, NDArray[np.float32]]):  # type: ignore[no-untyped-def]
+def load(tmp_path: Path, text: str, answers: dict[str, NDArray[np.float32]]):
     network = tiny.constants(tmp_path / "net.onnx", (1, 3, 32, 64), answers)
     network.with_suffix(".toml").write_text(text)
     return load_network("detector", ModelSpec(str(network)))
@@ -93,7 +93,7 @@ def test_an_object_in_two_tiles_is_one() -> None:
     for view in views:
         inside = view.x0_px <= box[0, 0] and box[0, 2] <= view.x1_px
         seen = tuple(view.to_network(box)[0].tolist())
-        parts.append(decoder.read(maps([(0, seen, 0.8)] if inside else []), view))  # type: ignore[list-item]
+        parts.append(decoder.read(maps([(0, seen, 0.8)] if inside else []), view))
     assert sum(len(part.scores) for part in parts) == 2
     found = decoder.merge(parts, views)
     np.testing.assert_allclose(found.boxes_px, box, atol=1e-4)

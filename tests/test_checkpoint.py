@@ -80,7 +80,6 @@ def test_a_checkpoint_is_independent_of_its_graph() -> None:
 def test_a_checkpoint_after_an_edge_from_an_older_frame() -> None:
     graph, log = PoseGraph(*SETTINGS["measured"]), list(WORLDS[0][:10])
     before, last = log[-2].cc, log[-1].cc
-    assert before is not None
     assert last is not None
     log[-1] = replace(
         log[-1], cc=replace(last, from_frame=before.from_frame, T_from_to=before.T_from_to @ last.T_from_to)
@@ -135,7 +134,6 @@ def test_inconsistent_parts_are_rejected() -> None:
     """Whole by its sum, but not what this code writes."""
     whole = unpack(checkpoint(), PoseGraph(*SETTINGS["measured"]).settings)
     begun = whole.started
-    assert begun is not None
     landmarks: LandmarksState = unpacked(begun.factors[LandmarkPoints.name], LandmarksState)
     torn = packed(replace(landmarks, frames=landmarks.frames[1:]))
     for broken in (

@@ -20,7 +20,7 @@ from birdslam.runtime.options import configuration_of
 NOWHERE = "kitti:/nowhere/at/all"
 
 
-def configuration(*arguments: str):  # type: ignore[no-untyped-def]
+def configuration(*arguments: str):
     return configuration_of(parse(arguments))
 
 

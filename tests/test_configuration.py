@@ -175,8 +175,6 @@ def test_dump_round_trips() -> None:
 def test_the_deadline_follows_the_frame_rate() -> None:
     camera = Camera(64, 32, 50.0, 50.0, 32.0, 16.0, 1.5)
     slow, fast = (complete(Configuration(), camera, rate_hz).deadline_ns for rate_hz in (10.0, 40.0))
-    assert slow is not None
-    assert fast is not None
     assert slow == pytest.approx(4.0 * fast)
     paced = complete(load(None, {"source.rate": 40.0}), camera, 10.0)
     assert (paced.camera, paced.deadline_ns) == (camera, fast)

@@ -99,7 +99,6 @@ def _held(prior: ConstantVelocityPrior, measured: Pose, info: np.ndarray, steps:
     out = []
     for _ in range(steps):
         found = prior.fuse(START, measured, info, 0.1, LEVEL)
-        assert found is not None
         prior.update(SE2(float((START.R.T @ found[0].p)[2]), 0.0, 0.0), 0.1)
         out.append(found)
     return out

@@ -27,11 +27,10 @@ from birdslam.runtime.nodes.degradation import Degradation, Mode, modes
 from birdslam.runtime.nodes.inference import Inference
 from birdslam.runtime.nodes.nodes import PerceiveNode
 from birdslam.runtime.process.restarts import FIRST
-from birdslam.runtime.transport.bus import Message
 from birdslam.runtime.transport.presence import ring_path
 from birdslam.runtime.transport.ring import FrameRing
-from birdslam.runtime.wire import Trace
 from birdslam.types import INVALIDATING, Frame, FrameRef, Measurements, Status
+from tests.fake_bus import FakeBus, Inbox
 from tests.heads import Head
 
 CONFIG = DegradationConfig(window_frames=4, late_share=0.5, calm_frames=6, calm_share=0.5)
@@ -98,19 +97,6 @@ def test_what_runs_in_each_mode(monkeypatch: pytest.MonkeyPatch, mode: Mode, run
     assert {role: head.runs for role, head in heads.items()} == runs
 
 
-class Bus:
-    """`frames` wait to be received."""
-
-    def __init__(self, *frames: FrameRef) -> None:
-        self.frames = list(frames)
-
-    def subscriber(self, topic: str, depth: int | None = None) -> Any:
-        return self
-
-    def recv(self, timeout_s: float) -> Message | None:
-        return Message(self.frames.pop(0), Trace(), 0) if self.frames else None
-
-
 class Blind(FrontEnd):
     """Counts what it is shown."""
 
@@ -141,7 +127,7 @@ def test_coasting_processes_few_frames_and_reports_it(tmp_path: Path, pixels: di
     )
     frontend = Blind()
     with Inference(configuration) as networks:
-        node = PerceiveNode(configuration, networks, frontend, Bus(), FIRST)  # type: ignore[arg-type]
+        node = PerceiveNode(configuration, networks, frontend, FakeBus(), FIRST)
         records: list[Measurements] = []
         for number in range(12):  # each a second old when it is done
             stamps = {"t_source_ns": number * 100_000_000, "t_capture_ns": 0, "t_utc_ns": 0}
@@ -162,14 +148,15 @@ def test_overtaken_frame_is_predicted(tmp_path: Path, pixels: dict[str, int]) ->
     stamps = {"t_source_ns": 0, "t_capture_ns": 0, "t_utc_ns": 0}
     came = [FrameRef(frame_id=number, **pixels, **stamps) for number in range(3)]
     end = FrameRef(frame_id=5, slot=-1, **stamps, status=(Status.END_OF_SOURCE,))
-    bus, frontend = Bus(*came), Blind()
+    waiting, frontend = Inbox(came), Blind()
     records: list[Measurements] = []
     with Inference(configuration) as networks:
-        node = PerceiveNode(configuration, networks, frontend, bus, FIRST)  # type: ignore[arg-type]
+        node = PerceiveNode(configuration, networks, frontend, FakeBus(frame=waiting), FIRST)
         while (message := node.receive(0.0)) is not None:
             records += node.step(message.record)
             if message.record.frame_id == 2:
-                bus.frames += [*(FrameRef(frame_id=number, **pixels, **stamps) for number in (3, 4)), end]
+                for later in (*(FrameRef(frame_id=number, **pixels, **stamps) for number in (3, 4)), end):
+                    waiting.come(later)
     assert [record.frame_id for record in records] == [0, 1, 2, 3, 4, 5]  # none is left out
     assert [record.frame_id for record in records if Status.COASTING in record.status] == [0, 1, 3]
     assert frontend.shown == [2, 4]  # the newest, and the last: the end overtakes nothing
@@ -185,8 +172,7 @@ def test_background_work_runs_only_without_degradation(tmp_path: Path, pixels: d
     )
     configuration = complete(configuration, Camera(64, 32, 50.0, 50.0, 32.0, 16.0, 1.5), 33.0)
     with Inference(configuration) as networks:
-        node = PerceiveNode(configuration, networks, Blind(), Bus(), FIRST)  # type: ignore[arg-type]
-        assert networks.run_in_background is not None
+        node = PerceiveNode(configuration, networks, Blind(), FakeBus(), FIRST)
         done = networks.run_in_background(lambda: "lanes")
         assert len(list(node.step(FrameRef(frame_id=0, **pixels, t_source_ns=0, t_capture_ns=0, t_utc_ns=0)))) == 1
         assert done.result(timeout=60.0) == "lanes"

@@ -60,7 +60,6 @@ def seen() -> Seen:
     out = Seen(recording, [], [], [], [])
     for frame in recording.undistorted_frames():
         boxes = looking.start(frame.frame_id, frame.image).result().detections
-        assert boxes is not None
         given_boxes = external_detections(boxes.boxes_px, list(boxes.labels), boxes.scores)
         _, estimate, placed = slam.step(frame, given_boxes)
         out.frames.append(frame)
@@ -133,7 +132,6 @@ def test_ids_of_external_tracker_are_kept() -> None:
 def test_only_filters_ids_along_with_boxes() -> None:
     both = external_detections([[0, 0, 9, 9], [5, 5, 9, 9]], ["cat", "car"], [0.5, 0.6], [3, 4])
     ids = both.only({"car"}).track_ids
-    assert ids is not None
     assert ids.tolist() == [4]
 
 
@@ -183,12 +181,11 @@ def test_edge_sigma_follows_the_detector_family(tmp_path: Path) -> None:
     theirs = [Corners(np.array([[10.0, 20.0], [40.0, 60.0]]))]
     assert norfair_adapter.from_norfair(theirs, detector=own).edge_sigma == own
     with pytest.raises(ValueError, match="unknown detector family 'yolo'; expected one of rrc, yolox"):
-        external_detections(boxes, labels, detector="yolo")  # type: ignore[arg-type]
+        external_detections(boxes, labels, detector="yolo")
     file = tmp_path / "boxes.txt"
     file.write_text("1,-1,10,20,30,40,0.9\n")
     configuration = load(None, {"source.detections": str(file), "source.detector": "yolox"})
     read = source_detections(configuration)
-    assert read is not None
     assert read[0].edge_sigma == FAMILIES["yolox"]
     with pytest.raises(ConfigurationError, match=r"source\.detector"):
         load(None, {"source.detector": "yolo"})
@@ -345,7 +342,6 @@ def test_norfair_objects_keep_ids_and_get_positions(seen: Seen) -> None:
         corners = [Corners(found.boxes_px[i].reshape(2, 2), scores=np.array([0.9, 0.9])) for i in x]
         tracked = [Tracked(100 + k, corner) for k, corner in enumerate(corners)]
         ours = norfair_adapter.from_norfair(tracked)
-        assert ours.track_ids is not None
         assert ours.track_ids.tolist() == [100, 101, 102]
         norfair_adapter.add_metres(tracked, slam.step(frame, ours)[2])
     tracks = {each.last_detection.data["birdslam"].track for each in tracked if each.last_detection.data["birdslam"]}

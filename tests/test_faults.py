@@ -95,7 +95,7 @@ def test_nothing_leaks_over_a_hundred_restarts(place: Path) -> None:
         for _ in restarted(vehicle, len(NODES)):  # once round, so that all is there that ever will be
             continue
         before = held(vehicle)
-        epochs = [vehicle.planner.latest().estimate.epoch for _ in restarted(vehicle, 100)]  # type: ignore[union-attr]
+        epochs = [vehicle.planner.latest().estimate.epoch for _ in restarted(vehicle, 100)]
         until_s = time.monotonic() + 60.0
         while any(after > before[what] for what, after in held(vehicle).items()) and time.monotonic() < until_s:
             vehicle.planner.wait(0.1)  # a dead peer's link is given up after its lease

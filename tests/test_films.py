@@ -106,7 +106,6 @@ def test_other_codecs_are_read_too(name: str, codec: str, tmp_path: Path) -> Non
         pytest.skip(f"this PyAV has no {codec}")
     seen = frames(film(tmp_path / name, range(0, 400, 40), codec))
     assert [frame.error for frame in seen] == [None] * 10
-    assert seen[4].image is not None
     assert seen[4].image[:20, :30].mean() > seen[4].image[40:].mean() + 80.0
 
 
@@ -130,7 +129,6 @@ def test_interlaced_film_is_deinterlaced_or_refused(tmp_path: Path) -> None:
             frames(path)
         return
     for k, frame in enumerate(frames(path)):
-        assert frame.image is not None
         true = wide[::2, 8 * k : 8 * k + WIDTH].astype(float)
         assert np.corrcoef(frame.image[::2, :, 0].ravel(), true.ravel())[0, 1] > 0.9
 
@@ -139,7 +137,6 @@ def test_sound_and_odd_sizes_are_supported(tmp_path: Path) -> None:
     assert len(frames(film(tmp_path / "a.mp4", range(0, 400, 40), audio=True))) == 10
     odd = Camera(97, 65, 80.0, 80.0, 48.0, 32.0, 1.4)
     (first, *_) = frames(film(tmp_path / "b.mp4", range(0, 400, 40), size=(97, 65)), odd)
-    assert first.image is not None
     assert first.image.shape == (65, 97, 3)
 
 
@@ -208,7 +205,6 @@ def test_truncated_transport_stream_is_reported(prefix: bytes, tmp_path: Path) -
     assert 5 < len(seen) < 20
     assert not any(frame.error for frame in seen)
     assert last.image is None
-    assert last.error is not None
     assert last.error.endswith(f"cut.ts: ends within a packet, after {len(seen)} frames: cut off")
 
 
@@ -360,7 +356,6 @@ def test_pixels_of_anamorphic_films_are_made_square(tmp_path: Path, name: str, a
     assert VideoRecording.frame_size(path, BagTopics()) == (round(width * aspect), height)
     camera = Camera(round(width * aspect), height, 100.0, 100.0, 60.0, 54.0, height_m=1.5)
     image = frames(path, camera)[1].image
-    assert image is not None
     bright = image[..., 0] > 128
     across, down = bright.any(axis=0).sum(), bright.any(axis=1).sum()
     assert across == pytest.approx(80, abs=4)
@@ -370,7 +365,7 @@ def test_pixels_of_anamorphic_films_are_made_square(tmp_path: Path, name: str, a
 def moving_film(path: Path, numbers: Sequence[int], quality: str = "20") -> Path:
     """Frames of a texture that moves by 3 px a frame; two films of the same numbers differ by their compression."""
     texture = cv2.GaussianBlur(np.random.default_rng(3).integers(0, 256, (480, 2400), dtype=np.uint8), (0, 0), 4.0)
-    texture = np.asarray(cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX), np.uint8)  # type: ignore[call-overload]
+    texture = np.asarray(cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX), np.uint8)
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=30, options={"crf": quality})
         stream.width, stream.height, stream.pix_fmt = 320, 240, "yuv420p"

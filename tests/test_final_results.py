@@ -240,7 +240,7 @@ def test_every_frame_up_to_the_last_estimate_is_drawn(tmp_path: Path) -> None:
             yield number, number * 10**8, None if number == 5 else grey
 
     first = estimates[0].frame_id
-    with DriveVideo(tmp_path / "v.mp4", CAMERA, 10.0, iter(images())) as video:  # type: ignore[arg-type]
+    with DriveVideo(tmp_path / "v.mp4", CAMERA, 10.0, iter(images())) as video:
         for estimate in estimates:
             if estimate.frame_id != first + 3:  # its frame shows the one before
                 video.add(estimate)
@@ -325,8 +325,8 @@ def test_a_live_camera_that_is_recorded_without_images_has_no_video(tmp_path: Pa
         camera, rate_hz = CAMERA, 30.0
 
     with pytest.raises(ConfigurationError, match="--record-images"):
-        check_results(load(None, settings), Source())  # type: ignore[arg-type]
-    check_results(load(None, {**settings, "recording.images": True}), Source())  # type: ignore[arg-type]
+        check_results(load(None, settings), Source())
+    check_results(load(None, {**settings, "recording.images": True}), Source())
 
 
 def test_a_temporary_recording_is_made_where_one_is_needed_with_images_of_a_live_camera(tmp_path: Path) -> None:

@@ -220,7 +220,6 @@ while True:
 def start_writer(path: Path, die_at: int = -1) -> tuple[subprocess.Popen[str], int, np.ndarray]:
     command = [sys.executable, "-c", WRITER, str(path), str(die_at)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT)
-    assert process.stdout is not None
     epoch = int(process.stdout.readline())
     return process, epoch, np.memmap(path.with_name("count"), np.int64, "r", shape=(1,))
 

@@ -283,7 +283,6 @@ def test_accuracy_may_follow_its_fix() -> None:
     lines = (epoch(1, gst) + epoch(2, gga) + epoch(3)).decode().splitlines()
     found = [fix for line in lines if (fix := reader.take(line)) is not None] + [reader.finish()]
     assert [round(fix[3], 3) for fix in found if fix] == [round(math.hypot(3.0, 4.0) / math.sqrt(2.0), 3), 3.6, 5.0]
-    assert found[0] is not None
     assert found[0][1:3] == pytest.approx((51.05, -114.05))
 
 
@@ -344,7 +343,6 @@ def test_fixes_of_a_bag_have_their_covariance(tmp_path: Path) -> None:
     camera = replace_camera()
     configuration = load(None, {"source.uri": f"rosbag:{bag}", "results.gnss": "topic:/gps/fix", "camera": camera})
     fixes = recorded_fixes(configuration)
-    assert fixes is not None
     assert [fix.sigma_m for fix in fixes(0).fixes] == [5.0, 2.0, 2.0]
     with pytest.raises(ConfigurationError, match="not a ROS bag"):
         recorded_fixes(load(None, {"source.uri": "demo", "results.gnss": "topic:/gps/fix"}))

@@ -170,7 +170,7 @@ def test_earlier_distance_does_not_affect_relative_poses() -> None:
     far = 100_000
     first = world.measurements[0]
     approach = [replace(first, cv=(), vv=(), cp=(), lanes=(), status=())]
-    step = replace(world.measurements[1].cc, from_frame=0, to_frame=1, T_from_to=SE2(30.0, 0.5, 0.4))  # type: ignore[type-var]
+    step = replace(world.measurements[1].cc, from_frame=0, to_frame=1, T_from_to=SE2(30.0, 0.5, 0.4))
     approach += [
         replace(approach[0], frame_id=k, t_source_ns=k, cc=replace(step, from_frame=k - 1, to_frame=k))
         for k in range(1, 1000)
@@ -461,7 +461,6 @@ def test_map_has_the_observed_landmarks() -> None:
     for m in world.measurements:
         graph.optimise(m)
         gained = graph.map_update()
-        assert gained is not None
         assert gained.frame_id == m.frame_id
         T = SE2(*world.ego[m.frame_id])
         expected = [T @ np.array([p.x_m, p.y_m]) for p in m.lanes]
@@ -484,12 +483,10 @@ def test_lane_points_keep_their_lanes() -> None:
     )
     graph.optimise(plain)
     gained = graph.map_update()
-    assert gained is not None
     assert gained.lane_ids == ()
     for m in named:
         graph.optimise(m)
     gained = graph.map_update()
-    assert gained is not None
     assert gained.lane_ids == (7, -1, 9, -1, 7, -1)
     assert len(gained.lanes_m) == 6
 
@@ -508,12 +505,11 @@ def test_memory_is_constant_over_3000_frames() -> None:
     for m in world.measurements:
         estimate = graph.optimise(m)
         assert estimate.epoch == 0
-        rows.append(len(graph.window.P))  # type: ignore[union-attr]
+        rows.append(len(graph.window.P))
         landmarks.append(len(on_the_road))
     assert max(rows) <= StateLayout(config.ego_nodes, vehicles=4).size
     assert max(landmarks) <= 6
     gained = graph.map_update()
-    assert gained is not None
     assert len(gained.landmarks_m) == 200
     assert len(gained.lanes_m) == 100 * DriveConfig().lane_points
 
@@ -576,7 +572,7 @@ def test_any_small_world_gives_sound_estimates(
     world = drive(config, seed)
     graph = PoseGraph(
         GraphConfig(constant_velocity=constant_velocity, ego_nodes=ego_nodes),
-        WeightsConfig(mode=mode, leave_out=()),  # type: ignore[arg-type]
+        WeightsConfig(mode=mode, leave_out=()),
     )
     for m in world.measurements:
         estimate = graph.optimise(m)
@@ -609,7 +605,7 @@ def test_invalid_numbers_raise_nothing(cov: tuple[float, ...], T: SE2) -> None:
         cp=tuple(replace(e, cov=(cov[0], cov[1], cov[3], cov[8]), x_m=T.x_m) for e in bad[15].cp),
         lanes=(LanePoint(1e300, 1e300),),
     )
-    bad[20] = replace(bad[20], cc=replace(bad[20].cc, T_from_to=T, cov=cov))  # type: ignore[type-var]
+    bad[20] = replace(bad[20], cc=replace(bad[20].cc, T_from_to=T, cov=cov))
     for config in (GraphConfig(), EQ_6):
         for estimate in run(bad, config):
             assert np.isfinite(estimate.cov).all()
@@ -658,5 +654,5 @@ def test_the_other_contenders_solve_the_same_world(kind: str) -> None:
     for m in world.measurements:
         poses = contender.step(m)
         expected = [world.ego[m.frame_id], *(world.vehicles[e.vehicle][m.frame_id] for e in m.cv)]
-        for (pose, _), truth in zip(poses, expected, strict=True):  # type: ignore[call-overload]
+        for (pose, _), truth in zip(poses, expected, strict=True):
             np.testing.assert_allclose(between(np.array([pose.x(), pose.y(), pose.theta()]), truth), 0.0, atol=1e-6)

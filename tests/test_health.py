@@ -135,7 +135,7 @@ def test_remaining_budget_is_kept_in_the_trace() -> None:
 
 
 def scheduled(**settings: object) -> Configuration:
-    return Configuration(source=SourceConfig(uri="kitti:x"), realtime=RealtimeConfig(**settings))  # type: ignore[arg-type]
+    return Configuration(source=SourceConfig(uri="kitti:x"), realtime=RealtimeConfig(**settings))
 
 
 def test_recording_needs_no_permissions() -> None:
@@ -341,7 +341,7 @@ def test_doctor_reports_problems(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     )
 
     def with_realtime(**settings: object) -> Configuration:
-        return msgspec.structs.replace(healthy, realtime=RealtimeConfig(**settings))  # type: ignore[arg-type]
+        return msgspec.structs.replace(healthy, realtime=RealtimeConfig(**settings))
 
     cores = findings_of("cores", with_realtime(perceive=NodeScheduling(cpus=(min(os.sched_getaffinity(0)), 9999))))
     assert (cores.verdict, "perceive: 9999" in cores.found) == ("warning", True)

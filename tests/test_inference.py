@@ -49,7 +49,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> Made:
         monkeypatch.setattr(inference, "load_network", lambda role, spec, *others: heads[role])
         spec = ModelSpec("none.onnx")
         configuration = Configuration(
-            source=SourceConfig(rate=rate),  # type: ignore[arg-type]
+            source=SourceConfig(rate=rate),
             models=ModelsConfig(detector=spec, segmenter=spec, shipped=False),
             perceive=PerceiveConfig(deadline_ms=deadline_ms),
         )
@@ -118,7 +118,6 @@ def test_background_work_starts_after_its_frame(made: Made) -> None:
     detector, segmenter = Gated("detector"), Gated("segmenter")
     with made(detector, segmenter, 1.0) as networks:
         aside = networks.run_in_background
-        assert aside is not None
         networks.start(frame(0))
         begun = threading.Event()
         future = aside(begun.set)
@@ -141,7 +140,6 @@ def test_background_work_yields_to_frames(made: Made) -> None:
             second.set()
 
         aside = networks.run_in_background
-        assert aside is not None
         networks.start(frame(0))
         future = aside(lambda: (begun.wait(60.0), parts()))
         begun = threading.Event()
@@ -174,8 +172,6 @@ def test_boxes_alone_are_those_of_the_whole_network() -> None:
             seen = [networks.start(Frame(k, 0, 0, 0, image)).result() for k, image in enumerate(images)]
         found.append([result.detections for result in seen])
     for whole, boxes in zip(*found, strict=True):
-        assert whole is not None
-        assert boxes is not None
         np.testing.assert_array_equal(whole.boxes_px, boxes.boxes_px)
         np.testing.assert_array_equal(whole.scores, boxes.scores)
 

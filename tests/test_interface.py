@@ -64,7 +64,6 @@ def running(*command: str) -> Iterator[subprocess.Popen[str]]:
 
 def until_said(process: subprocess.Popen[str], *wanted: str) -> None:
     """Until each of these was the beginning of a line, in this order."""
-    assert process.stdout is not None
     lines: list[str] = []
     left, end_s = list(wanted), time.monotonic() + LIMIT_S
     while left:

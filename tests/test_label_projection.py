@@ -59,7 +59,7 @@ def test_labels_outside_the_image_are_truncated_or_dropped(tmp_path: Path) -> No
     label, T = right.labels_of(0)[0], right.T_cam0_camera
 
     def seen(x_m: float, z_m: float, **changed: object) -> list[tuple[tuple[float, ...], float]]:
-        moved = replace(label, place_m=(x_m, tracking_world.HEIGHT_M, z_m), **changed)  # type: ignore[arg-type]
+        moved = replace(label, place_m=(x_m, tracking_world.HEIGHT_M, z_m), **changed)
         return [(found.box_px, found.truncated) for found in project_labels([moved], right.camera, T)]
 
     ((box, truncated),) = seen(-8.0, 9.5)
@@ -82,7 +82,6 @@ def test_real_bodies_project_to_the_boxes_that_were_drawn() -> None:
     apart = []
     for label in whole:
         hull = hull_px(label, drawn.camera, drawn.T_cam0_camera)
-        assert hull is not None
         apart.append((hull - label.box_px) / (label.box_px[3] - label.box_px[1]))
     assert np.abs(np.median(apart, axis=0)).max() < 0.02
     assert np.percentile(np.abs(apart), 95) < 0.05

@@ -165,5 +165,4 @@ def test_lane_is_not_a_landmark_on_the_map() -> None:
         cp = (corner, *lanes) if k < 3 else ()
         graph.optimise(Measurements(frame_id=k, t_source_ns=k * 10**8, t_capture_ns=0, t_utc_ns=0, cc=cc, cp=cp))
     gained = graph.map_update()
-    assert gained is not None
     assert len(gained.landmarks_m) == 1

@@ -190,7 +190,6 @@ def test_lines_over_a_crest_and_through_a_sag(vertical_per_m: float) -> None:
     assert np.mean(np.abs(off) < 2.0 * np.array(sigmas)) > 0.9
     assert bends[-1] == pytest.approx(vertical_per_m, abs=4e-4)
     by_images = tracker.lines().vertical
-    assert by_images is not None
     assert by_images.per_m == pytest.approx(bends[-1], abs=2e-4), "without the prior it is a little more"
     assert 0.0 < by_images.sigma_per_m < 4e-4
 
@@ -594,13 +593,11 @@ def test_the_leader_is_the_nearest_in_the_egos_lane() -> None:
         UserInEgo(k, SE2(x, y, 0.0), cov, 4.0, 8.0) for k, x, y in ((1, 30.0, 0.1), (2, 12.0, 3.4), (3, 20.0, -0.3))
     ]
     found = with_users(lanes, cars, 9.0, Traffic())
-    assert found.leader is not None
     assert found.leader.vehicle == 3
     assert found.leader.gap_m == pytest.approx(18.0)
     assert found.leader.time_gap_s == pytest.approx(2.0)
     assert found.leader.gap_sigma_m == pytest.approx(0.5)
     standing = with_users(lanes, cars, 0.0, Traffic()).leader
-    assert standing is not None
     assert standing.time_gap_s is None
 
 
@@ -615,7 +612,6 @@ def test_lane_assignment_uses_bounds_and_sigmas() -> None:
     users = crowd(30)
     for user, place in zip(users, with_users(lanes, users, 10.0, Traffic()).vehicles, strict=True):
         own, x, y = lanes.ego, user.T_ego_vehicle.x_m, user.T_ego_vehicle.y_m
-        assert own is not None
         bend = 0.001 * max(0.0, x - own.to_m) ** 2
         sigma = math.sqrt(0.1 + own.sigma_m(min(x, own.to_m)) ** 2 + bend**2 + 1e-6)
         inside = math.erf((own.left_m(x) - y) / sigma / math.sqrt(2)) - math.erf(
@@ -663,7 +659,6 @@ def test_cyclists_can_be_leaders_and_pedestrians_cannot() -> None:
     found = with_users(lanes, [person_in_ego(walker), person_in_ego(cyclist)], 8.0, Traffic())
     assert [(place.vehicle, place.ego_lane > 0.9) for place in found.vehicles] == [(5, True), (6, True)]
     assert found.vehicles[0].oncoming == 0.0  # pedestrians have no direction of traffic
-    assert found.leader is not None
     assert found.leader.vehicle == 6
 
 
@@ -674,7 +669,6 @@ def test_lane_along_the_line_of_sight_needs_no_distance() -> None:
     on_sight = UserInEgo(1, SE2(30.0, 6.0, 0.0), np.outer(far, far), 4.0, 8.0)
     ahead = UserInEgo(2, SE2(30.0, 6.0, 0.0), np.diag([36.0, 0.01, 0.01]), 4.0, 8.0)
     surely, perhaps = with_users(lanes, [on_sight, ahead], 10.0, Traffic()).vehicles
-    assert lanes.ego is not None
     of_lane_m = lanes.ego.sigma_m(30.0)
     assert surely.ego_lane == pytest.approx(math.erf(1.75 / of_lane_m / math.sqrt(2)), abs=1e-3)
     assert perhaps.ego_lane == pytest.approx(math.erf(1.75 / math.hypot(1.2, 0.1, of_lane_m) / math.sqrt(2)), abs=1e-3)
@@ -825,7 +819,6 @@ def test_traffic_determines_the_direction_of_a_lane() -> None:
         users = [UserInEgo(20 + k, SE2(30.0, 3.4, 0.0), cov, 4.0, 9.0)]
         assert with_users(lanes, users, 10.0, again) == with_users(lanes, users, 10.0, traffic)
     (after, _) = with_users(lanes, users, 10.0, traffic).lanes
-    assert after.oncoming is not None
     assert after.oncoming < 0.01
     far = UserInEgo(2, SE2(30.0, 3.4, 0.0), np.diag([1.0, 4.0, 0.01]), 4.0, 9.0)
     unsure = Traffic()
@@ -843,9 +836,7 @@ def test_merging_lane_reports_its_end() -> None:
     (narrow,) = lane_row((merging(-0.06), right)).lanes
     (wide,) = lane_row((merging(0.06), right)).lanes
     (straight,) = lane_row((merging(0.0), right)).lanes
-    assert narrow.ends_m is not None
     assert 24.0 <= narrow.ends_m <= 34.0  # 1.6 m narrower
-    assert wide.splits_m is not None
     assert 16.0 <= wide.splits_m <= 28.0
     assert (narrow.splits_m, wide.ends_m, straight.ends_m, straight.splits_m) == (None,) * 4
 

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -19,43 +17,12 @@ from birdslam.runtime.maps import map_process
 from birdslam.runtime.maps.map_process import WAITING_IMAGES, LiveMap
 from birdslam.runtime.process.restarts import FIRST
 from birdslam.runtime.process.vitals import Vitals
-from birdslam.runtime.transport.endpoints import Message
 from birdslam.runtime.transport.presence import ring_path
 from birdslam.runtime.transport.ring import FrameRing
-from birdslam.runtime.wire import Trace
 from birdslam.types import Estimate, FrameRef
+from tests.fake_bus import FakeBus
 
 FRAMES = 30
-
-
-class Queue:
-    """What a subscriber gives, put in by hand."""
-
-    dropped = malformed = 0
-
-    def __init__(self) -> None:
-        self.waiting: deque[Message] = deque()
-
-    def put(self, record: Any, trace: Trace | None = None) -> None:
-        self.waiting.append(Message(record, trace or Trace(), 0))
-
-    def recv(self, timeout_s: float) -> Message | None:
-        return self.waiting.popleft() if self.waiting else None
-
-
-class Topics:
-    """In place of the bus."""
-
-    def __init__(self) -> None:
-        self.frame, self.estimate = Queue(), Queue()
-
-    def subscriber(self, topic: str, depth: int) -> Queue:
-        queue: Queue = getattr(self, topic)
-        queue.waiting = deque(maxlen=depth)
-        return queue
-
-    def publisher(self, topic: str) -> Queue:
-        return Queue()
 
 
 @pytest.fixture
@@ -76,8 +43,8 @@ class Drive:
         }
         configuration = msgspec.structs.replace(load(None, settings), camera=CAMERA)
         (folder / "logs").mkdir()
-        self._ring, self._topics, self._began_ns = ring, Topics(), time.monotonic_ns()
-        self.live = LiveMap(configuration, self._topics, Vitals(), FIRST)  # type: ignore[arg-type]
+        self._ring, self._bus, self._began_ns = ring, FakeBus(), time.monotonic_ns()
+        self.live = LiveMap(configuration, self._bus, Vitals(), FIRST)
 
     def turn(self, number: int, newest: Estimate, of_image: Estimate | None) -> None:
         slot, sequence = self._ring.write(np.zeros((CAMERA.height_px, CAMERA.width_px), np.uint8))
@@ -85,9 +52,9 @@ class Drive:
         of_frame |= {"width_px": CAMERA.width_px, "height_px": CAMERA.height_px}
         times = {"t_source_ns": newest.t_source_ns, "t_utc_ns": 0}
         far_ns = self._began_ns + number * 10**12  # regardless of the budget
-        self._topics.frame.put(FrameRef(frame_id=newest.frame_id, t_capture_ns=far_ns, **times, **of_frame))
+        self._bus.inboxes["frame"].come(FrameRef(frame_id=newest.frame_id, t_capture_ns=far_ns, **times, **of_frame))
         if of_image is not None:
-            self._topics.estimate.put(of_image)
+            self._bus.inboxes["estimate"].come(of_image)
         self.live.turn(0.0)
 
 

@@ -35,7 +35,6 @@ signal.pause()
 @pytest.mark.parametrize(("suite_code", "processes"), [(WORKER, 3), (CONTROLLER, 5)], ids=["worker", "controller"])
 def test_processes_of_a_killed_suite_are_killed(suite_code: str, processes: int) -> None:
     with subprocess.Popen([sys.executable, "-c", suite_code], stdout=subprocess.PIPE, text=True) as suite:
-        assert suite.stdout is not None
         pidfds = [os.pidfd_open(int(pid)) for pid in suite.stdout.readline().split()]
         try:
             assert len(pidfds) == processes

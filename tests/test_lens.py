@@ -83,7 +83,6 @@ def test_straight_drive_determines_only_distortion() -> None:
 @pytest.mark.parametrize("pitch_rad", first(1, [-0.06, 0.05]))
 def test_direction_of_travel_determines_pitch(pitch_rad: float) -> None:
     lens = calibrated(drive(-0.2, math.radians(40.0), images=40, pitch_rad=pitch_rad), 1.1 * FOCAL_PX)
-    assert lens.pitch is not None
     assert abs(lens.pitch.pitch_rad - pitch_rad) < 3.0 * lens.pitch.sigma_rad
     assert lens.pitch.sigma_rad < 0.015
 
@@ -105,7 +104,6 @@ def test_a_wide_lens_is_about_equidistant() -> None:
         r = np.linalg.norm(u, axis=1, keepdims=True)
         images.append(CornersOfImage(corners.ids, focal_px * u / r * np.arctan(r) + middle))
     wide = self_calibrate(images, SIZE_PX, focal_px, 0.08, by_view=True, fisheye=True)
-    assert wide is not None
     assert wide.fisheye
     assert wide.k1 == pytest.approx(0.0, abs=3.0 * wide.k1_sigma)
     assert wide.k1_sigma < 0.1

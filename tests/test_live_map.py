@@ -136,7 +136,6 @@ def test_planner_gets_poses_in_the_map(tmp_path_factory: pytest.TempPathFactory,
         with Planner(run.vehicle, run.runtime_dir) as late:  # the last pose is there for who comes later
             in_map(late, lambda here: here.pose is not None, "one that came late knows")
         out = run.stop()
-    assert found.T_map_ego is not None
     assert abs(found.T_map_ego.y_m) < 0.5
     assert -1.0 < found.T_map_ego.x_m < STEP_M * FRAMES + 5.0
     assert np.sqrt(found.cov[0, 0]) < 0.5
@@ -161,7 +160,6 @@ def test_everything_is_loaded_before_the_first_frame(tmp_path_factory: pytest.Te
         Planner(run.vehicle, run.runtime_dir) as planner,
     ):
         first = in_map(planner, lambda here: here.pose is not None, "the map process is at work").pose
-        assert first is not None
         assert first.keyframes == 0
         assert "faiss" in Path(f"/proc/{run.node_pid('map')}/maps").read_text()
 
@@ -175,11 +173,10 @@ def test_failures_of_the_map_process_do_not_affect_the_drive(
             fault()
             hears(planner, 10)
             before = planner.in_map().pose
-            assert before is not None
             after = before.frame_id + 3
             in_map(
                 planner,
-                lambda here, after=after: (  # type: ignore[misc]
+                lambda here, after=after: (
                     here.pose is not None and here.pose.frame_id > after and here.pose.keyframes >= 4
                 ),
                 "its successor goes on with the map that was kept",

@@ -44,8 +44,6 @@ def test_a_fitting_manifest_loads(tmp_path: Path) -> None:
 def test_a_dynamic_axis_is_fixed_by_the_manifest(tmp_path: Path, shape: tiny.Shape) -> None:
     network = load_network("segmenter", write(tiny.echo(tmp_path / "a.onnx", shape), SEGMENTER))
     findings = network.run(np.full((48, 64), 200, np.uint8))
-    assert findings is not None
-    assert findings.segmentation is not None
     assert findings.segmentation.road.shape == (48, 64)
 
 

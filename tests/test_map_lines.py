@@ -48,11 +48,11 @@ def lanes(row: int) -> Lanes:
 
 
 def driven(place_map: PlaceMap, rows: range, with_lines: bool, seed: int = 1) -> PlaceMap:
-    session = MapSession(CAMERA, place_map, True, extract=lambda features: features)  # type: ignore[arg-type,return-value]
+    session = MapSession(CAMERA, place_map, True, extract=lambda features: features)
     for estimate, seen, _ in drive(STREET, rows, seed):
         if with_lines:
             estimate = msgspec.structs.replace(estimate, lanes=lanes(rows.start + estimate.frame_id))
-        session.step(estimate, seen)  # type: ignore[arg-type]
+        session.step(estimate, seen)
     session.finish()
     return place_map
 

@@ -49,7 +49,7 @@ OTHER = replace(build(along([0.0] * 200), seed=2), max_seen=120)
 
 def session(place_map: PlaceMap, extend: bool) -> MapSession:
     """Features come ready-made in place of images."""
-    return MapSession(CAMERA, place_map, extend, extract=lambda features: features)  # type: ignore[arg-type,return-value]
+    return MapSession(CAMERA, place_map, extend, extract=lambda features: features)
 
 
 def driven(
@@ -57,10 +57,7 @@ def driven(
 ) -> list[tuple[Localisation, SE2]]:
     """The session's result for each frame, and the true ego pose in the frame of the route."""
     running = session(place_map, extend)
-    out = [
-        (running.step(estimate, seen), T)  # type: ignore[arg-type]
-        for estimate, seen, T in drive(street, rows, seed, **how)  # type: ignore[arg-type]
-    ]
+    out = [(running.step(estimate, seen), T) for estimate, seen, T in drive(street, rows, seed, **how)]
     running.finish()
     return out
 
@@ -89,7 +86,7 @@ def second_drive() -> Iterator[tuple[Estimate, Features, SE2]]:
 def after_first(mapped: bytes) -> MapSession:
     running = session(decode_map(mapped), extend=False)
     for estimate, seen, _ in islice(second_drive(), FIRST):
-        here = running.step(estimate, seen)  # type: ignore[arg-type]
+        here = running.step(estimate, seen)
     assert here.state is MapState.LOCALISED
     return running
 
@@ -177,7 +174,7 @@ def test_new_map_starts_with_the_first_valid_frame() -> None:
         place_map = PlaceMap(MapCamera.of(CAMERA))
         running = session(place_map, extend=True)
         for number, (estimate, seen, _) in enumerate(drive(STREET, range(30), 3)):
-            running.step(msgspec.structs.replace(estimate, valid=valid or number >= 3), seen)  # type: ignore[arg-type]
+            running.step(msgspec.structs.replace(estimate, valid=valid or number >= 3), seen)
         running.finish()
         keyframes[valid] = place_map.keyframes[0]
     assert np.trace(keyframes[False].cov) < 2.0 * np.trace(keyframes[True].cov)
@@ -189,7 +186,7 @@ def carried(localised: MapSession, looks: bool, scale_sigma_rel: float = 0.0) ->
     elsewhere = drive(OTHER, range(60), 3)
     for (estimate, _, _), (_, seen, _) in zip(islice(second_drive(), FIRST, None), elsewhere, strict=False):
         estimate = msgspec.structs.replace(estimate, scale_sigma_rel=scale_sigma_rel)
-        count += localised.step(estimate, seen if looks else None).state is MapState.LOCALISED  # type: ignore[arg-type]
+        count += localised.step(estimate, seen if looks else None).state is MapState.LOCALISED
     return count
 
 
@@ -209,10 +206,8 @@ def test_near_points_correct_a_wrong_guess(mapped: bytes) -> None:
     px = seen.px + np.where(wrong[:, None], chance.uniform(-90.0, 90.0, seen.px.shape), 0.0)
     local = place_map.around(place_map.near(T, 12.0)[0])
     truth = locate(CAMERA, seen, local, None)
-    assert truth is not None
     guess = truth.T_keyframe_ego @ SE2.exp(np.array([-1.2, 1.35, -0.03]))
     found = locate(CAMERA, replace(seen, px=px), local, guess, 120.0)
-    assert found is not None
     assert found.T_keyframe_ego.between(truth.T_keyframe_ego).log() == pytest.approx(np.zeros(3), abs=0.1)
 
 
@@ -241,7 +236,6 @@ def test_far_points_give_the_most_likely_pose_not_the_guess(mapped: bytes, wrong
     depth = 0.05 * (points - (0.0, 0.0, CAMERA.height_m))
     local = LocalMap(decode_map(mapped).keyframes[0], points, depth, descriptors)
     found = locate(CAMERA, Features(px, np.full(len(px), 0.5), descriptors), local, guess, 120.0)
-    assert found is not None
     assert found.T_keyframe_ego.log() == pytest.approx(np.zeros(3), abs=0.1)
 
 
@@ -257,7 +251,6 @@ def test_uncertain_depths_do_not_bias_lateral_offset(mapped: bytes) -> None:
         descriptors = chance.integers(0, 256, (60, 32), dtype=np.uint8)
         local = LocalMap(keyframe, points + errs * from_camera, 0.06 * from_camera, descriptors)
         found = locate(CAMERA, Features(px, np.full(60, 0.5), descriptors), local, T, 120.0)
-        assert found is not None
         off.append(T.between(found.T_keyframe_ego).log())
         sigma.append(np.sqrt(np.diag(found.cov)))
     assert np.mean(off, axis=0)[1] == pytest.approx(0.0, abs=0.03)
@@ -269,7 +262,7 @@ def test_implausible_step_ends_localisation(localised: MapSession) -> None:
     states = []
     for number, (estimate, seen, _) in enumerate(islice(second_drive(), FIRST, FIRST + 10)):
         estimate = msgspec.structs.replace(estimate, T_world_ego=estimate.T_world_ego @ SE2(-3.0, 0.0, 0.0))
-        states.append(localised.step(estimate, seen if number > 5 else None).state)  # type: ignore[arg-type]
+        states.append(localised.step(estimate, seen if number > 5 else None).state)
     assert [states[0], states[5]] == [MapState.ODOMETRY_ONLY] * 2
     assert states[9] is MapState.LOCALISED
 
@@ -304,14 +297,14 @@ def test_kidnapped_ego_is_relocalised(mapped: bytes) -> None:
     then = list(drive(STREET, range(70, 105), 4, first_frame=20))
     T_odom = first[-1][0].T_world_ego
     for estimate, seen, _ in first:
-        running.step(estimate, seen)  # type: ignore[arg-type]
+        running.step(estimate, seen)
     found = []
     for estimate, seen, T in then:
         moved = type(estimate)(
             **{name: getattr(estimate, name) for name in estimate.__struct_fields__}
             | {"T_world_ego": T_odom @ estimate.T_world_ego}
         )
-        found.append((running.step(moved, seen), T))  # type: ignore[arg-type]
+        found.append((running.step(moved, seen), T))
     assert errors(found[-1:])[0, :2] == pytest.approx([0.0, 0.0], abs=1.0)
     wrong = [np.hypot(*error[:2]) for error in errors(found[20:])]
     assert max(wrong) < 1.0
@@ -335,7 +328,7 @@ def test_unrelated_drive_does_not_change_the_map(mapped: bytes) -> None:
     place_map = decode_map(mapped)
     running = session(place_map, extend=True)
     for estimate, seen, _ in drive(OTHER, range(40), 3):
-        running.step(estimate, seen)  # type: ignore[arg-type]
+        running.step(estimate, seen)
     running.finish()
     assert encode_map(place_map) == mapped
     assert running.lost_keyframes > 3
@@ -466,13 +459,11 @@ def test_run_refuses_unusable_maps(mapped: bytes, tmp_path: Path) -> None:
     path = tmp_path / "street.map"
     path.write_bytes(mapped)
     writes = MapChoice.of(load(None, {"results.map": str(path)}))
-    assert writes is not None
     assert len(writes.open(CAMERA)) > 20
     other = replace_camera(height_m=1.2)
     with pytest.raises(ConfigurationError, match="another camera"):
         writes.open(other)
     reads = MapChoice.of(load(None, {"results.map_only": str(path)}))
-    assert reads is not None
     assert len(reads.open(other)) > 20
     path.write_bytes(mapped[:-1])
     with pytest.raises(MapError, match="truncated"):
@@ -483,7 +474,7 @@ def test_run_refuses_unusable_maps(mapped: bytes, tmp_path: Path) -> None:
         MapChoice(tmp_path / "none" / "a.map", True).open(CAMERA)
 
 
-def replace_camera(**changes: float):  # type: ignore[no-untyped-def]
+def replace_camera(**changes: float):
     return type(CAMERA)(**({name: getattr(CAMERA, name) for name in CAMERA.__struct_fields__} | changes))
 
 
@@ -494,7 +485,7 @@ def test_frames_before_confirmation_are_localised_afterwards(mapped: bytes, tmp_
     running, trajectory = session(decode_map(mapped), extend=False), MapTrajectory()
     with TrajectoryFiles(tmp_path) as files:
         for estimate, seen, _ in drive(STREET, range(20, 45), 3):
-            files.write(trajectory.add(running.step(estimate, seen), estimate))  # type: ignore[arg-type]
+            files.write(trajectory.add(running.step(estimate, seen), estimate))
         files.write(trajectory.finish())
     assert trajectory.frames_before > 0
     assert trajectory.counts == {"localised": 25, "odometry_only": 0, "lost": 0}
@@ -510,7 +501,7 @@ def test_no_backward_localisation_over_invalid_odometry(mapped: bytes) -> None:
     rows = []
     for number, (estimate, seen, _) in enumerate(drive(STREET, range(20, 45), 3)):
         estimate = msgspec.structs.replace(estimate, valid=number != 1)
-        rows += trajectory.add(running.step(estimate, seen), estimate)  # type: ignore[arg-type]
+        rows += trajectory.add(running.step(estimate, seen), estimate)
     rows += trajectory.finish()
     assert trajectory.frames_before > 1
     assert [row.state for row in rows[:3]] == [MapState.LOST, MapState.LOCALISED, MapState.LOCALISED]
@@ -522,7 +513,7 @@ def test_trajectory_without_localisation_is_an_empty_file(tmp_path: Path) -> Non
     running = session(place_map, extend=False)
     with TrajectoryFiles(tmp_path) as files:
         for estimate, seen, _ in drive(STREET, range(40), 3):
-            files.write(trajectory.add(running.step(estimate, seen), estimate))  # type: ignore[arg-type]
+            files.write(trajectory.add(running.step(estimate, seen), estimate))
         assert trajectory.counts["lost"] > 10  # too far back by now: no memory is kept of them
         files.write(trajectory.finish())
     assert trajectory.counts["lost"] == 40
@@ -633,7 +624,6 @@ def test_the_maps_of_many_drives_become_one(files: dict[str, Path], tmp_path: Pa
         (folders[-1] / DRIVE_MAP).write_bytes(files[name].read_bytes())
     (tmp_path / "without").mkdir()  # a drive that failed
     found = join([*folders, tmp_path / "without"], tmp_path / "town.map")
-    assert found is not None
     assert set(found.inside) == {"own", "beside"}
     assert found.outside == ("other",)
     whole = read_map(tmp_path / "town.map")

@@ -98,7 +98,7 @@ def scales(given: Sequence[float], frames: int) -> list[float]:
     total, street = 1.0, Street(1.0)
     street.drive(scale)
     for wanted in given:
-        scale.frame_scale = lambda view, s=wanted: s / total  # type: ignore[method-assign, misc] # noqa: B023
+        scale.frame_scale = lambda view, s=wanted: s / total  # noqa: B023
         total *= scale.measure_scale(Pose(np.eye(3), np.zeros(3)), _view(street))
         out.append(total)
     return out

@@ -178,8 +178,6 @@ def test_encoded_body_is_decoded(pose: SE2, size_m: tuple[float, float, float], 
     if example.objects[0, COLUMN["taught"]] == 0.0:
         return
     found = read(perfect_answer(example)).detections
-    assert found is not None
-    assert found.boxes3d is not None
     assert found.labels == (label,)
     assert found.boxes_px[0] == pytest.approx(body.box_px + 0.5, abs=1e-3)
     bodies = found.boxes3d.in_metres(cam)
@@ -203,10 +201,6 @@ def test_mirrored_world_is_decoded_mirrored(pose: SE2) -> None:
     if plain.objects[0, COLUMN["taught"]] == 0.0:
         return
     a, b = (read(perfect_answer(example)).detections for example in (plain, mirrored))
-    assert a is not None
-    assert a.boxes3d is not None
-    assert b is not None
-    assert b.boxes3d is not None
     assert b.boxes_px[0, [2, 1, 0, 3]] == pytest.approx(a.boxes_px[0] * [-1, 1, -1, 1] + [WIDTH, 0, WIDTH, 0], abs=1e-3)
     assert math.remainder(a.boxes3d.alpha_rad[0] + b.boxes3d.alpha_rad[0], 2.0 * math.pi) == pytest.approx(0, abs=1e-3)
     assert b.boxes3d.depth_m == pytest.approx(a.boxes3d.depth_m)
@@ -217,7 +211,6 @@ def test_canonical_depth_is_metric_for_every_camera(focal: float) -> None:
     cam = camera(focal)
     frame = world(cam)
     found = read(perfect_answer(encode(frame, WHOLE, WIDTH, HEIGHT, TargetsConfig())))
-    assert found.depth is not None
     assert found.depth.canonical_focal_rel == pytest.approx(CANONICAL_FOCAL_REL)
     upper, lower = 1.0 / frame.depth_m[::2, ::2], 1.0 / frame.depth_m[1::2, 1::2]
     nearness = 0.5 * (upper + lower)  # of a plane at the corner where four pixels meet
@@ -253,7 +246,6 @@ def test_barely_visible_objects_are_ignored() -> None:
 def test_masks_cover_the_image(size: tuple[int, int]) -> None:
     frame = world(camera())
     found = read(perfect_answer(encode(frame, WHOLE, WIDTH, HEIGHT, TargetsConfig())), *size).segmentation
-    assert found is not None
     assert found.road.shape == found.lane.shape == size[::-1]
     rows = (np.arange(size[1]) * HEIGHT) // size[1]
     columns = (np.arange(size[0]) * WIDTH) // size[0]
@@ -278,7 +270,6 @@ def test_better_of_two_boxes_is_kept() -> None:
         np.exp(tensors["body"][0, BODY["sides"], y, x]) + np.array([2.0, 0.0, -2.0, 0.0])
     )
     found = read(tensors).detections
-    assert found is not None
     assert len(found) == 1
     assert found.scores[0] == pytest.approx(1.0 / (1.0 + math.exp(-6.0)))
 
@@ -296,7 +287,6 @@ def test_padding_is_part_of_the_focal_length() -> None:
     found = decoder(size=size).read(
         perfect_answer(encode(world(camera()), WHOLE, WIDTH, HEIGHT, TargetsConfig())), view
     )
-    assert found.depth is not None
     assert found.depth.canonical_focal_rel == pytest.approx(2.0 * CANONICAL_FOCAL_REL)
     assert found.depth.depth_m.shape == (HEIGHT // 2, WIDTH // 4)
 
@@ -341,7 +331,6 @@ def test_false_and_missed_boxes_lower_the_metrics() -> None:
     cam = camera()
     frame = world(cam, vehicle(cam, SE2(14.0, 2.0, 0.2)), replace(vehicle(cam, SE2(14.0, -2.5, 0.2)), object_id=1))
     found = read(perfect_answer(encode(frame, WHOLE, WIDTH, HEIGHT, TargetsConfig()))).detections
-    assert found is not None
     grades = Grades()
     false = Detections(np.array([found.boxes_px[0], [10.0, 10.0, 40.0, 40.0]]), np.array([0.9, 0.8]), ("car", "car"))
     grades.add(Findings(detections=false), frame)
@@ -395,7 +384,6 @@ def test_multitask_network_yields_roles_to_other_networks() -> None:
     own = Head("detector", Findings(detections=findings("bus").detections))
     beside = Networks([own, Head("multitask", findings("car"), every=2)], run_at_once)
     first, second = (beside.start(frame, image).result() for frame in (0, 1))
-    assert first.detections is not None
     assert first.detections.labels == ("bus",)
     assert first.segmentation is not None
     assert second.ages == {"detector": 0, "segmenter": 1, "depth": 1}
@@ -421,7 +409,6 @@ def test_the_shipped_network_takes_any_image(shipped: Any, size: tuple[int, int]
     rng = np.random.default_rng(3)
     image = rng.integers(0, 256, (size[1], size[0]) if grey else (size[1], size[0], 3), dtype=np.uint8)
     found = shipped.run(image)
-    assert found is not None
     assert found.segmentation.road.shape == found.segmentation.lane.shape == size[::-1]
     assert np.isfinite(found.depth.depth_m).all()
     assert (found.depth.depth_m > 0.0).all()

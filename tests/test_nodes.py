@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import deque
 from collections.abc import Generator
 from pathlib import Path
 from typing import Any
@@ -23,31 +22,11 @@ from birdslam.runtime.process.restarts import FIRST, Assignment, Resume
 from birdslam.runtime.transport.bus import Message
 from birdslam.runtime.transport.presence import ring_path
 from birdslam.runtime.transport.ring import FrameReader
-from birdslam.runtime.wire import Trace
 from birdslam.sources.recording import RecordedFrame
 from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, Status
+from tests.fake_bus import FakeBus, Inbox
 from tests.recordings import SMALL as CAMERA
 from tests.records import new_estimate
-
-
-class Inbox:
-    """A subscriber that a test fills."""
-
-    dropped = malformed = 0
-
-    def __init__(self) -> None:
-        self.messages: deque[Message] = deque()
-
-    def recv(self, timeout_s: float | None = None) -> Message | None:
-        return self.messages.popleft() if self.messages else None
-
-
-class FakeBus:
-    def __init__(self) -> None:
-        self.inbox, self.speeds = Inbox(), Inbox()
-
-    def subscriber(self, topic: str, depth: int | None = None) -> Inbox:
-        return self.speeds if topic == "speed" else self.inbox
 
 
 class Source:
@@ -85,8 +64,8 @@ def make_capture(
         runtime=RuntimeConfig(runtime_dir=str(place), **limits),
     )
     bus = FakeBus()
-    node = CaptureNode(configuration, bus, lambda timeout_s: None, assignment)  # type: ignore[arg-type]
-    return node, bus.inbox, FrameReader(ring_path("test", place))
+    node = CaptureNode(configuration, bus, lambda timeout_s: None, assignment)
+    return node, bus.inboxes["estimate"], FrameReader(ring_path("test", place))
 
 
 def receive(node: CaptureNode) -> Message:
@@ -103,7 +82,7 @@ def come_back(inbox: Inbox, ref: FrameRef) -> None:
     estimate = new_estimate(
         frame_id=ref.frame_id, T_world_ego=msgspec.convert([0.0, 0.0, 0.0], SE2), valid=False, status=ref.status
     )
-    inbox.messages.append(Message(estimate, Trace(), 0))
+    inbox.come(estimate)
 
 
 def test_rate_max_keeps_a_window_and_ends_last(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -117,7 +96,6 @@ def test_rate_max_keeps_a_window_and_ends_last(monkeypatch: pytest.MonkeyPatch, 
     assert refs[1].slot == -1
     assert refs[1].status == (Status.FRAME_UNREADABLE,)
     pixels = reader.read(refs[2])
-    assert pixels is not None
     assert pixels.shape == (32, 64, 3)
     assert (pixels == 2).all()
     come_back(inbox, refs[1])
@@ -187,7 +165,7 @@ def test_new_optimizer_reports_a_new_epoch(tmp_path: Path) -> None:
     stamps = {"t_source_ns": 5, "t_capture_ns": 6, "t_utc_ns": 7}
     epochs, told = [], []
     for number in range(3):  # each was killed
-        node = OptimizeNode(configuration, FakeBus())  # type: ignore[arg-type]
+        node = OptimizeNode(configuration, FakeBus())
         for frame_id in (2 * number, 2 * number + 1):
             estimate, *_ = node.step(Measurements(frame_id=frame_id, **stamps))
             assert isinstance(estimate, Estimate)
@@ -199,7 +177,7 @@ def test_new_optimizer_reports_a_new_epoch(tmp_path: Path) -> None:
 
 
 def test_optimize_completes_the_map_before_the_end() -> None:
-    node = OptimizeNode(Configuration(source=SourceConfig(rate="max")), FakeBus())  # type: ignore[arg-type]
+    node = OptimizeNode(Configuration(source=SourceConfig(rate="max")), FakeBus())
     stamps = {"t_source_ns": 5, "t_capture_ns": 6, "t_utc_ns": 7}
     first, *_ = node.step(Measurements(frame_id=0, **stamps, status=(Status.NOT_INITIALISED,)))
     assert isinstance(first, Estimate)

@@ -165,7 +165,6 @@ def test_bonnet_edge_is_found(row: int) -> None:
     changes = [bonnet.update(with_bonnet(road_image(rng), row, rng), TOP_PX, 1.0) for _ in range(8)]
     assert bonnet.present
     assert sum(changes) == 1
-    assert bonnet.rows is not None
     assert abs(int(bonnet.rows[320]) - row) < 10
     below, above = np.array([[320, row + 5]]), np.array([[320, row - 15]])
     assert len(bonnet.above(below)) == 0
@@ -211,7 +210,6 @@ def test_bonnet_with_changing_reflections_is_kept() -> None:
         changes.append(bonnet.update(np.where(edge, mirrored, road_image(rng)).astype(np.uint8), TOP_PX, 1.0))
         assert bonnet.present or k < 10
     assert sum(changes) == 1  # it comes once
-    assert bonnet.rows is not None
     assert 135 <= bonnet.rows[320] <= 150
 
 
@@ -233,5 +231,4 @@ def test_bonnet_with_text_starts_at_its_edge() -> None:
         image = with_bonnet(road_image(rng), 150, rng)
         cv2.putText(image, "CAMERA 2020-01-01 12:00:00 51.0000 -114.0000", (8, 188), cv2.FONT_HERSHEY_PLAIN, 1.2, 235)
         bonnet.update(image, TOP_PX, 1.0)
-    assert bonnet.rows is not None
     assert abs(int(bonnet.rows[320]) - 150) < 10

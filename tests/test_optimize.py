@@ -24,7 +24,7 @@ from birdslam.runtime.process.restarts import FIRST, Assignment, Resume
 from birdslam.runtime.transport.bus import Message
 from birdslam.runtime.wire import Trace
 from birdslam.types import INVALIDATING, Attitude, Estimate, FrameRef, Measurements, Status
-from tests.test_nodes import Inbox
+from tests.fake_bus import FakeBus
 
 MS = 1_000_000
 HEAD_BYTES = 64  # of a checkpoint in its file, before its data; first its number, which is written last
@@ -32,15 +32,12 @@ DRIVE = drive(DriveConfig(frames=60, vehicles=3, traffic="convoy"), 1).measureme
 CALM = Configuration().slam
 
 
-class Bus:
-    """One that a test fills; `past` is what perceive still has."""
+class Bus(FakeBus):
+    """`past` is what perceive still has."""
 
     def __init__(self, past: tuple[Measurements, ...] = (), alive: bool = True) -> None:
-        self.inboxes: dict[str, Inbox] = {}
+        super().__init__()
         self._past, self._alive = past, alive
-
-    def subscriber(self, topic: str, depth: int | None = None) -> Inbox:
-        return self.inboxes.setdefault(topic, Inbox())
 
     def wait_alive(self, nodes: set[str], timeout_s: float) -> set[str]:
         return set() if self._alive else set(nodes)
@@ -65,7 +62,7 @@ def ref(frame_id: int, t_capture_ns: int = 0, status: tuple[Status, ...] = ()) -
 
 
 def announce(bus: Bus, frame_id: int, t_capture_ns: int) -> None:
-    bus.inboxes["frame"].messages.append(Message(ref(frame_id, t_capture_ns), Trace(), t_capture_ns))
+    bus.inboxes["frame"].come(ref(frame_id, t_capture_ns), t_capture_ns)
 
 
 def estimates(node: OptimizeNode, record: Any) -> list[Estimate]:
@@ -96,7 +93,6 @@ def test_a_frame_is_overdue_when_its_estimate_could_not_come_in_time() -> None:
     assert announced.wait_s(1100 * MS) == pytest.approx(0.03)
     assert announced.overdue(1129 * MS) is None
     late = announced.overdue(1165 * MS)  # of two that are, the newer one
-    assert late is not None
     assert late.record.ref.frame_id == 1
     assert announced.overdue(1165 * MS) is None
     announced.answered(7)
@@ -111,7 +107,6 @@ def test_a_frame_that_was_answered_before_it_was_announced_is_never_overdue() ->
     assert announced.overdue(10**12) is None
     announced.add(Message(ref(8, 0), Trace(), 0))
     late = announced.overdue(10**12)
-    assert late is not None
     assert late.record.ref.frame_id == 8
 
 
@@ -123,14 +118,13 @@ def test_end_of_source_is_not_awaited() -> None:
 
 def test_silent_perceive_leads_to_coasting_then_invalid(tmp_path: Path) -> None:
     bus = Bus()
-    node = OptimizeNode(configuration(tmp_path, degradation=DegradationConfig(coast_max_ms=100.0)), bus)  # type: ignore[arg-type]
+    node = OptimizeNode(configuration(tmp_path, degradation=DegradationConfig(coast_max_ms=100.0)), bus)
     measured = [made for record in DRIVE[:20] for made in estimates(node, record)]
     assert measured == alone(20)
     coasted = []
     for frame_id in range(20, 26):
         announce(bus, frame_id, time.monotonic_ns() - 1000 * MS)
         late = node.receive(0.0)
-        assert late is not None
         assert isinstance(late.record, Overdue)
         coasted += estimates(node, late.record)
     assert [made.frame_id for made in coasted] == list(range(20, 26))
@@ -158,12 +152,12 @@ def test_coasting_keeps_invalid_estimates_invalid() -> None:
 
 def test_at_rate_max_every_frame_is_waited_for() -> None:
     bus = Bus()
-    OptimizeNode(Configuration(source=SourceConfig(rate="max")), bus)  # type: ignore[arg-type]
+    OptimizeNode(Configuration(source=SourceConfig(rate="max")), bus)
     assert set(bus.inboxes) == {"measurements"}
 
 
 def test_late_measurements_correct_the_published_estimate(tmp_path: Path) -> None:
-    node = OptimizeNode(configuration(tmp_path), Bus())  # type: ignore[arg-type]
+    node = OptimizeNode(configuration(tmp_path), Bus())
     for record in DRIVE[:10]:
         estimates(node, record)
     goal = alone(14)
@@ -172,7 +166,6 @@ def test_late_measurements_correct_the_published_estimate(tmp_path: Path) -> Non
     assert (guessed.frame_id, better.frame_id) == (12, 12)
     assert Status.PERCEPTION_LATE in better.status
     step, passed_ns = DRIVE[10].cc, DRIVE[10].t_source_ns - DRIVE[9].t_source_ns
-    assert step is not None
     way = SE2.exp(step.T_from_to.log() * (better.t_source_ns - goal[10].t_source_ns) / passed_ns)
     assert better.T_world_ego == (goal[10].T_world_ego @ way) != guessed.T_world_ego
     assert node.counters()["outrun"] == 1
@@ -185,7 +178,7 @@ def test_late_measurements_correct_the_published_estimate(tmp_path: Path) -> Non
 @settings(max_examples=10)
 def test_published_frame_numbers_never_fall(lateness: list[int], seed: int) -> None:
     """Measurements come in their order, each so many frames late; a frame is coasted over when it has waited two."""
-    node = OptimizeNode(Configuration(source=SourceConfig(rate="max")), Bus())  # type: ignore[arg-type]
+    node = OptimizeNode(Configuration(source=SourceConfig(rate="max")), Bus())
     goal = alone(40)
     told: list[Estimate] = []
     waiting: deque[int] = deque()
@@ -216,15 +209,16 @@ def after(frame_id: int) -> Assignment:
 
 
 def killed_at(place: Path, frames: int) -> list[Estimate]:
-    node = OptimizeNode(configuration(place), Bus())  # type: ignore[arg-type]
+    node = OptimizeNode(configuration(place), Bus())
     return [made for record in DRIVE[:frames] for made in estimates(node, record)]
 
 
 def test_a_killed_optimizer_resumes_from_its_checkpoint(tmp_path: Path) -> None:
     before = killed_at(tmp_path, 20)
     bus = Bus(past=DRIVE[5:23])
-    node = OptimizeNode(configuration(tmp_path), bus, after(19))  # type: ignore[arg-type]
-    bus.inboxes["measurements"].messages.extend(Message(record, Trace(), 0) for record in DRIVE[21:30])  # some twice
+    node = OptimizeNode(configuration(tmp_path), bus, after(19))
+    for record in DRIVE[21:30]:  # some twice
+        bus.inboxes["measurements"].come(record)
     told: list[Estimate] = []
     while (message := node.receive(0.0)) is not None:
         told += estimates(node, message.record)
@@ -235,7 +229,7 @@ def test_a_killed_optimizer_resumes_from_its_checkpoint(tmp_path: Path) -> None:
 
 def test_measurements_since_an_older_checkpoint_are_added_and_not_published_twice(tmp_path: Path) -> None:
     killed_at(tmp_path, 15)
-    node = OptimizeNode(configuration(tmp_path), Bus(past=DRIVE[:23]), after(19))  # type: ignore[arg-type]
+    node = OptimizeNode(configuration(tmp_path), Bus(past=DRIVE[:23]), after(19))
     told = []
     while (message := node.receive(0.0)) is not None:
         told += estimates(node, message.record)
@@ -247,7 +241,7 @@ def test_measurements_since_an_older_checkpoint_are_added_and_not_published_twic
 def test_gap_in_measurements_starts_a_new_epoch(tmp_path: Path, gap: str) -> None:
     killed_at(tmp_path, 20)
     bus = Bus(alive=gap != "perceive is gone", past=DRIVE[25:30] if gap == "too long" else ())
-    node = OptimizeNode(configuration(tmp_path), bus, after(19))  # type: ignore[arg-type]
+    node = OptimizeNode(configuration(tmp_path), bus, after(19))
     message = node.receive(0.0)
     (first,) = estimates(node, DRIVE[30] if message is None else message.record)
     assert Status.GRAPH_RESET in first.status
@@ -256,12 +250,12 @@ def test_gap_in_measurements_starts_a_new_epoch(tmp_path: Path, gap: str) -> Non
 
 def test_checkpoint_of_an_older_epoch_is_not_restored(tmp_path: Path) -> None:
     once = configuration(tmp_path, checkpoint_ms=1e9)  # of the first frame, and no more
-    node = OptimizeNode(once, Bus())  # type: ignore[arg-type]
+    node = OptimizeNode(once, Bus())
     for record in DRIVE[:10]:
         estimates(node, record)
     for made in (msgspec.structs.replace(DRIVE[20], cc=None), *DRIVE[21:23]):
         assert estimates(node, made)[0].epoch == 1
-    again = OptimizeNode(configuration(tmp_path), Bus(past=DRIVE[1:23]), after(22))  # type: ignore[arg-type]
+    again = OptimizeNode(configuration(tmp_path), Bus(past=DRIVE[1:23]), after(22))
     (first,) = estimates(again, DRIVE[23])
     assert (first.epoch, Status.GRAPH_RESET in first.status) == (2, True)
 
@@ -269,11 +263,11 @@ def test_checkpoint_of_an_older_epoch_is_not_restored(tmp_path: Path) -> None:
 def test_first_process_and_other_configuration_start_fresh(tmp_path: Path) -> None:
     killed_at(tmp_path, 20)
     other = msgspec.structs.replace(CALM, graph=msgspec.structs.replace(CALM.graph, ego_nodes=7))
-    node = OptimizeNode(configuration(tmp_path, slam=other), Bus(past=DRIVE[15:23]), after(19))  # type: ignore[arg-type]
+    node = OptimizeNode(configuration(tmp_path, slam=other), Bus(past=DRIVE[15:23]), after(19))
     assert node.receive(0.0) is None
     assert estimates(node, DRIVE[20])[0].epoch == 1
     killed_at(tmp_path, 20)
-    node = OptimizeNode(configuration(tmp_path), Bus(past=DRIVE[15:23]), FIRST)  # type: ignore[arg-type]
+    node = OptimizeNode(configuration(tmp_path), Bus(past=DRIVE[15:23]), FIRST)
     assert node.receive(0.0) is None
     assert estimates(node, DRIVE[20])[0].epoch > 1
 
@@ -281,7 +275,7 @@ def test_first_process_and_other_configuration_start_fresh(tmp_path: Path) -> No
 def test_checkpoint_that_crashes_is_used_once(tmp_path: Path) -> None:
     killed_at(tmp_path, 20)
     for restored in (True, False):  # the first of them dies before it has kept another
-        node = OptimizeNode(configuration(tmp_path), Bus(past=DRIVE[15:23]), after(19))  # type: ignore[arg-type]
+        node = OptimizeNode(configuration(tmp_path), Bus(past=DRIVE[15:23]), after(19))
         assert (node.receive(0.0) is not None) == restored  # what has come since the checkpoint
 
 
@@ -322,7 +316,6 @@ def test_another_process_may_read_the_newest_checkpoint(tmp_path: Path) -> None:
     for frame_id in range(5):
         file.store(frame_id, 1, bytes([frame_id]) * (frame_id + 1))
         found = newest_checkpoint(path)
-        assert found is not None
         assert (found.frame_id, found.epoch, found.data) == (frame_id, 1, bytes([frame_id]) * (frame_id + 1))
     assert [kept.frame_id for kept in CheckpointFile(path).take()] == [4, 3]
     assert newest_checkpoint(path) is None
@@ -334,9 +327,7 @@ def test_damaged_checkpoint_is_skipped(tmp_path: Path) -> None:
     killed_at(tmp_path, 20)
     path = tmp_path / "test" / "checkpoint"
     kept = newest_checkpoint(path)
-    assert kept is not None
     overwrite(path, path.read_bytes().index(kept.data) + 200, bytes([77]) * 30)
-    node = OptimizeNode(configuration(tmp_path), Bus(past=DRIVE[10:23]), after(19))  # type: ignore[arg-type]
+    node = OptimizeNode(configuration(tmp_path), Bus(past=DRIVE[10:23]), after(19))
     message = node.receive(0.0)
-    assert message is not None
     assert message.record.frame_id == 19  # it goes on from the one before it

@@ -108,7 +108,7 @@ def test_frames_without_detector_are_processed_before_next_detections(every: int
     def drive(told: bool) -> tuple[list[list[float]], list[GroundPlane], list[int]]:
         vehicles, seen, roads, settled = out_of_sequence(), [], [], []
         localise, work = vehicles.tracker.localise_vehicles, []
-        vehicles.tracker.localise_vehicles = lambda *a: work.append(a) or localise(*a)  # type: ignore[method-assign]
+        vehicles.tracker.localise_vehicles = lambda *a: work.append(a) or localise(*a)
         for k in range(FRAMES):
             look = k // every * every
             known = look if k - look >= delay else look - every

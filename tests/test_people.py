@@ -155,7 +155,6 @@ def test_child_is_not_a_distant_adult() -> None:
     scene = Scene()
     for _ in range(4):
         (child,) = scene.see(found([box_of(8.0, 1.0, 1.1)])) or (None,)
-    assert child is not None
     assert child.x_m == pytest.approx(8.0, rel=0.12)  # an adult's box of that height is one at 12.5 m
     assert child.child > 0.5
     assert child.height_m == pytest.approx(1.1, rel=0.15)
@@ -221,7 +220,6 @@ def test_truncated_feet_give_no_position() -> None:
     x1, y1, x2, _ = box_of(3.4, 0.3)
     for _ in range(4):
         (person,) = scene.see(found([(x1, y1, x2, 374.0)])) or (None,)
-    assert person is not None
     assert abs(person.x_m - 3.4) < 3.0 * math.sqrt(person.cov[0])
 
 
@@ -334,7 +332,6 @@ def test_far_person_is_not_a_near_one_with_hidden_feet(far_m: float) -> None:
         (near,) = scene.see(found([box_of(9.0, 0.0)])) or (None,)
     for _ in range(5):
         people = scene.see(found([box_of(far_m, 0.0)]))
-    assert near is not None
     (far,) = [person for person in people if person.age_ns == 0]
     assert far.person != near.person
     assert far.x_m == pytest.approx(far_m, rel=0.15)
@@ -362,7 +359,7 @@ def measured(frame: int, people: tuple[FollowedPerson, ...], ahead_m: float = 0.
     t_ns = frame * 100_000_000
     return Measurements(
         frame_id=frame, t_source_ns=t_ns, t_capture_ns=t_ns, t_utc_ns=t_ns, cc=cc, people=people,
-        ground=Ground(height_m=1.65), **fields,  # type: ignore[arg-type]
+        ground=Ground(height_m=1.65), **fields,
     )  # fmt: skip
 
 
@@ -370,7 +367,7 @@ def person_at(
     x_m: float, y_m: float, vx: float = 0.0, vy: float = 0.0, number: int = 0, **fields: object
 ) -> FollowedPerson:
     numbers = {"cov": (0.04, 0.0, 0.0, 0.01), "velocity_cov": (0.01, 0.0, 0.0, 0.01)} | fields
-    return FollowedPerson(person=FIRST_PERSON + number, x_m=x_m, y_m=y_m, vx_mps=vx, vy_mps=vy, **numbers)  # type: ignore[arg-type]
+    return FollowedPerson(person=FIRST_PERSON + number, x_m=x_m, y_m=y_m, vx_mps=vx, vy_mps=vy, **numbers)
 
 
 def driven(frames: int, *people: FollowedPerson) -> tuple[PoseGraph, Estimate]:
@@ -444,12 +441,9 @@ def test_crossing_person_is_nearby_and_departing_one_is_not() -> None:
     people = person_at(12.0, 3.0, vy=-1.2), person_at(12.0, 6.0, vy=1.2, number=1), person_at(25.0, 0.0, number=2)
     _, estimate = driven(10, *people)
     crossing, leaving, ahead = (user.approach for user in estimate.people)
-    assert crossing is not None
     assert crossing.nearby
     assert crossing.time_s == pytest.approx(2.4, abs=0.2)
-    assert leaving is not None
     assert not leaving.nearby
-    assert ahead is not None
     assert ahead.time_s == pytest.approx(5.0, abs=0.1)
     told = nearby(estimate)
     assert told.users[0].vehicle == estimate.people[0].vehicle

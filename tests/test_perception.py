@@ -102,7 +102,6 @@ def test_views_cover_the_image_within_the_input(
     assert views[0].x0_px == 0
     assert views[-1].x1_px == width_px
     for a, b in pairwise(views):
-        assert tiles is not None
         assert a.x1_px - b.x0_px >= tiles.overlap * (a.x1_px - a.x0_px) - 2.0  # whole pixels
         assert a.x1_px - a.x0_px == b.x1_px - b.x0_px
     for view in views:
@@ -302,7 +301,6 @@ def test_masks_follow_their_class(tmp_path: Path) -> None:
     image[60:, 100:300] = (0, 200, 50)
     image[60:, 180:220] = (0, 200, 150)
     findings = load_network("segmenter", spec).run(image)
-    assert findings is not None
     masks = findings.segmentation
     assert isinstance(masks, Segmentation)
     assert masks.road.shape == masks.lane.shape == (100, 400)
@@ -319,8 +317,6 @@ def test_images_of_any_size(tmp_path: Path, shape: tuple[int, ...]) -> None:
         "detector", write(tiny.constant(tmp_path / "a.onnx", (1, 3, SIZE_PX, SIZE_PX), answer), DETECTOR)
     )
     findings = network.run(np.full(shape, 90, np.uint8))
-    assert findings is not None
-    assert findings.detections is not None
     assert findings.detections.labels == ("car",)
     (view,) = network.views(np.zeros(shape, np.uint8))
     np.testing.assert_allclose(view.to_network(findings.detections.boxes_px)[0][[0, 2]], [32, 96], atol=1e-3)
@@ -412,9 +408,7 @@ def test_dropped_frames_do_not_starve_a_head(every: int, gaps: list[int]) -> Non
         due = started is None or frame_id - started >= every
         assert runs == due
         started = frame_id if due else started
-        assert started is not None
         assert perception.ages == {"detector": frame_id - started}
-        assert perception.detections is not None
         assert perception.detections.scores[0] == started / 1000
         assert perception.status == (() if due else (Status.DETECTIONS_CARRIED,))
 
@@ -450,7 +444,7 @@ def test_unawaited_head_is_awaited_without_patience_limit() -> None:
     with ThreadPoolExecutor(2) as pool:
         heads = [FakeHead("segmenter", "segmenter", Schedule(awaited=False)), FakeHead()]
         for head in heads:
-            head.run = lambda image: some(0.2)  # type: ignore[method-assign]
+            head.run = lambda image: some(0.2)
         assert Networks(heads, pool.submit).start(5, IMAGE).result().ages == {"segmenter": 0, "detector": 0}
 
 
@@ -489,7 +483,7 @@ def test_restarted_source_discards_old_results() -> None:
 def test_masks_come_every_nth_run(slowdown: int, masks: int, gaps: list[int]) -> None:
     executor, alone = Executor(), object()
     head = FakeHead("multitask", "multitask")
-    networks = Networks([head], executor.submit, boxes_alone=alone)  # type: ignore[arg-type]
+    networks = Networks([head], executor.submit, boxes_alone=alone)
     networks.slowdown, networks.masks_every = slowdown, masks
     looks: list[int] = []
     for frame_id in np.cumsum([0, *gaps]).tolist():
@@ -500,13 +494,12 @@ def test_masks_come_every_nth_run(slowdown: int, masks: int, gaps: list[int]) ->
             assert (executor.runs[-1][0] is alone) != whole
             mask = np.full((2, 2), frame_id, np.int64)
             found = some(frame_id / 1000)
-            executor.finish(replace(found, segmentation=Segmentation(mask, mask)) if whole else found)  # type: ignore[arg-type]
+            executor.finish(replace(found, segmentation=Segmentation(mask, mask)) if whole else found)
             looks.append(frame_id)
         perception = pending.result()
         with_masks = looks[(len(looks) - 1) // masks * masks]
         assert perception.ages["detector"] == frame_id - looks[-1]
         assert perception.ages["segmenter"] == frame_id - with_masks
-        assert perception.segmentation is not None
         assert perception.segmentation.road[0, 0] == with_masks
         assert (Status.SEGMENTATION_CARRIED in perception.status) == (with_masks != frame_id)
         assert (Status.DETECTIONS_CARRIED in perception.status) == (looks[-1] != frame_id)
@@ -517,12 +510,8 @@ def test_boxes_of_shipped_network_do_not_depend_on_masks() -> None:
     network = load_network("multitask", spec, 1, ("depth",), ("segmentation",))
     image = np.random.default_rng(3).integers(0, 255, (96, 320, 3), np.uint8)
     whole, boxes = network.run(image), network.run_without(image)
-    assert whole is not None
-    assert boxes is not None
     assert whole.segmentation is not None
     assert (boxes.segmentation, boxes.depth, whole.depth) == (None, None, None)
-    assert whole.detections is not None
-    assert boxes.detections is not None
     np.testing.assert_array_equal(whole.detections.boxes_px, boxes.detections.boxes_px)
     np.testing.assert_array_equal(whole.detections.scores, boxes.detections.scores)
 
@@ -549,7 +538,7 @@ def frame(data_dir: Path, folder: str, index: int) -> NDArray[np.uint8]:
     path = sorted((data_dir / folder).iterdir())[index]
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     assert image is not None
-    return image  # type: ignore[return-value]
+    return image
 
 
 SEQUENCE_00 = "kitti_odometry/sequences/00/image_0"
@@ -570,8 +559,6 @@ NEAR_CARS = [
 def test_near_cars_are_found(data_dir: Path, models_dir: Path, folder: str, index: int, box: tuple[float, ...]) -> None:
     network = public(models_dir / "yolox_nano_416.onnx")
     findings = network.run(frame(data_dir, folder, index))
-    assert findings is not None
-    assert findings.detections is not None
     cars = findings.detections.only({"car", "truck", "bus"})
     overlap = iou(np.vstack([np.array(box, float), cars.boxes_px]))[0, 1:]
     assert np.sum(overlap > 0.75) == 1
@@ -584,9 +571,7 @@ def test_the_road_ahead_is_road_and_the_sky_is_not(data_dir: Path, models_dir: P
     for folder, index in ((SEQUENCE_00, 10), (SEQUENCE_06, 5)):
         image = frame(data_dir, folder, index)
         findings = network.run(image)
-        assert findings is not None
         masks = findings.segmentation
-        assert masks is not None
         assert masks.road.shape == image.shape[:2]
         assert masks.road[300:360, 500:650].mean() > 0.95
         assert masks.road[:150].mean() < 0.01
@@ -599,11 +584,9 @@ def test_grey_and_colour_agree_and_are_deterministic(data_dir: Path, models_dir:
     grey = frame(data_dir, SEQUENCE_00, 50)
     images = [grey, cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)]
     network = public(models_dir / f"{name}.onnx")
-    found = [network.run(image) for image in images]  # type: ignore[arg-type]
+    found = [network.run(image) for image in images]
     found.append(load_network(role, ModelSpec(str(models_dir / f"{name}.onnx"))).run(grey))
     for other in found[1:]:
-        assert other is not None
-        assert found[0] is not None
         for one, two in ((found[0].detections, other.detections), (found[0].segmentation, other.segmentation)):
             assert (one is None) == (two is None)
             for key, value in vars(one or Perception()).items():
@@ -631,13 +614,9 @@ def test_detector_runs_on_each_tile(tmp_path: Path) -> None:
     views = network.views(image)
     assert [view.x0_px for view in views] == [0, 118, 236]
     found = network.run(image)
-    assert found is not None
-    assert found.detections is not None
     rx, ry = 148.0 / SIZE_PX, SIZE_PX / views[0].height_px  # tiles are 148 px wide: three, less their overlaps
     expected = [[view.x0_px + 40.0 * rx, 10.0 * ry, view.x0_px + 60.0 * rx, 40.0 * ry] for view in views]
     np.testing.assert_allclose(sorted(found.detections.boxes_px.tolist()), expected, atol=0.1)
     assert network.describe()["tiles"] == 3
     whole = load_network("detector", write(path, DETECTOR)).run(image)
-    assert whole is not None
-    assert whole.detections is not None
     np.testing.assert_allclose(whole.detections.boxes_px[:, ::2], box[:, ::2] * 3.0, atol=0.1)

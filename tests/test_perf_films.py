@@ -56,7 +56,6 @@ def test_uneven_true_steps_do_not_affect_the_ratio_at_any_rate() -> None:
             steps.append(Step(0.1 * k, 0.1 * every, 10.0, 10.0 * true / every, valid=k > 5, sigma_rel=0.02))
         courses.append(summary(steps))
     ratio = over(courses[1], courses[0])
-    assert ratio is not None
     assert abs(ratio - 1.0) < 0.015
     assert abs(courses[0]["speed_over_truth"] - courses[1]["speed_over_truth"]) > 0.03  # of frames it would be
     assert courses[0]["first_valid_s"] == pytest.approx(0.6)

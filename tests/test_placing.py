@@ -37,7 +37,6 @@ def depths(log_depth: float, sigma: float) -> Depths:
 def test_only_a_truncated_lower_edge_is_a_bound() -> None:
     assert seen_at(20.0, 2.0).sigma_cut is None
     cut = seen_at(5.0, 1.0)
-    assert cut.sigma_cut is not None
     assert cut.sigma_cut < 0.1 * cut.sigma_bottom
     ground_size, whole = GroundSizeFilter(CAMERA, GroundSizeConfig()), depths(math.log(18.0), 0.1)
     assert truncate_at_cut(whole, [seen_at(20.0, 2.0)], ground_size, 0.0) is whole

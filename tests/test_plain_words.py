@@ -26,7 +26,7 @@ def drive(frames: int = 100, invalid: int = 0, **more: object) -> DriveCounts:
         "scale_sigma_rel": 0.03 if frames > invalid else None,
         "camera_sigma_rel": 0.0,
     }
-    return DriveCounts(frames=frames, invalid_frames=invalid, **{**plain, **more})  # type: ignore[arg-type]
+    return DriveCounts(frames=frames, invalid_frames=invalid, **{**plain, **more})
 
 
 def test_every_status_has_a_meaning() -> None:

@@ -85,10 +85,8 @@ def test_body_round_trips_to_the_camera(tmp_path: Path) -> None:
     network = load_pointnet(ModelSpec(str(body(tmp_path, ANSWER))))
     points = patch()
     found = network.locate([points, points], ["car", "car"], CAMERA)  # a fixed batch of one is run twice
-    assert found is not None
     assert len(found) == 2
     frustum = frustum_of(points, network.manifest.points)
-    assert frustum is not None
     centre = frustum.to_camera(np.array([0.2, -0.1, 1.0]))
     np.testing.assert_allclose(found.centres_cam_m(CAMERA), [centre, centre], atol=1e-5)
     np.testing.assert_allclose(found.size_m[0], np.exp([0.1, 0.0, -0.1]) * [4.0, 2.0, 1.5], rtol=1e-5)
@@ -103,7 +101,6 @@ def test_body_round_trips_to_the_camera(tmp_path: Path) -> None:
 def test_front_may_be_reversed(tmp_path: Path) -> None:
     flipped = [*ANSWER[:9], -2.0, -1.0, -2.0]
     found = load_pointnet(ModelSpec(str(body(tmp_path, flipped)))).locate([patch(0.0)], ["car"], CAMERA)
-    assert found is not None
     np.testing.assert_allclose(found.alpha_rad, 0.5 - math.pi, atol=0.03)
 
 
@@ -121,7 +118,6 @@ def test_frustum_pointnets_own_outputs(tmp_path: Path) -> None:
     }
     path = answering(tmp_path, BINS, answers, {"points": (1, 64, 3), "class": (1, 2)})
     found = load_pointnet(ModelSpec(str(path))).locate([patch(0.0)], ["truck"], CAMERA)
-    assert found is not None
     np.testing.assert_allclose(found.size_m, [[11.0, 2.5, 3.0]], rtol=1e-6)
     np.testing.assert_allclose(found.depth_m, 14.0)
     # 270 deg about down from the right is ahead, 0 here; a quarter of 30 deg more is to the right
@@ -132,10 +128,8 @@ def test_frustum_pointnets_own_outputs(tmp_path: Path) -> None:
 def test_box_without_points_has_an_unknown_body(tmp_path: Path) -> None:
     network = load_pointnet(ModelSpec(str(body(tmp_path, ANSWER))))
     found = network.locate([patch()[:10], patch()], ["car", "car"], CAMERA)
-    assert found is not None
     assert np.isinf(found.sigma_depth_m).tolist() == [True, False]
     nothing = network.locate([], [], CAMERA)
-    assert nothing is not None
     assert len(nothing) == 0
 
 
@@ -174,7 +168,6 @@ def test_a_network_of_another_shape_is_refused(tmp_path: Path) -> None:
 def test_rotated_and_centred_points_round_trip(slope: float, z_m: float) -> None:
     points = patch(slope * z_m, z_m)
     frustum = frustum_of(points, Points(name="p", count=64, features=("x", "y", "z", "u", "v", "log_depth")))
-    assert frustum is not None
     back = np.array([frustum.to_camera(p) for p in frustum.features[:3].T.astype(np.float64)])
     # Each is one of the patch; the wall behind is left out
     assert (np.abs(back[:, None] - points[None]).sum(axis=-1).min(axis=1) < 1e-4).all()

@@ -115,7 +115,6 @@ def recorded(folder: Path, frames: int = 40) -> np.ndarray:
     """The folder of a drive with the true poses of the shipped drive; returns these, (frames, 3, 4) of camera 0."""
     recording = open_recording("demo")
     truth = recording.truth_poses()
-    assert truth is not None
     mount = mount_pose(recording.camera.ground)
     with Recorder(folder, recording.camera) as recorder:
         for k, frame in enumerate(recording.frames()):

@@ -74,7 +74,6 @@ def test_exact_depth_gives_position_and_axis(x_m: float, bearing: float, yaw_rad
     pose = SE2(x_m, bearing * x_m, yaw_rad)
     depth, boxes = scene([pose], (188, 621))
     found = fit_footprint(observed(boxes)[0], depth, CAMERA, CAMERA.ground, CONFIG)
-    assert found is not None
     off_m = found.centre_m - [pose.x_m, pose.y_m]
     # Seen face on, its far half is known by its class alone: the yaw there is soft
     assert np.linalg.norm(off_m) < 0.45 + 0.02 * x_m
@@ -86,7 +85,6 @@ def test_axis_is_accurate_near_and_oblique() -> None:
     for degrees in (20, 45, 70, 110, 150):
         depth, boxes = scene([SE2(10.0, 1.0, math.radians(degrees))])
         found = fit_footprint(observed(boxes)[0], depth, CAMERA, CAMERA.ground, CONFIG)
-        assert found is not None
         assert axis_error(found.yaw_rad, math.radians(degrees)) < math.radians(6)
         assert found.sigma_yaw_rad < math.radians(15)
 
@@ -103,7 +101,6 @@ def test_covariance_covers_depth_noise() -> None:
             sigma_rel=0.05,
         )
         found = fit_footprint(observed(boxes)[0], noisy, CAMERA, CAMERA.ground, CONFIG)
-        assert found is not None
         off_m = found.centre_m - [pose.x_m, pose.y_m]
         d2.append(off_m @ np.linalg.solve(found.cov, off_m))
     assert np.mean(np.array(d2) < 2.30) > 0.6  # 0.68 of a Gaussian
@@ -127,7 +124,6 @@ def test_unscaled_depth_map_is_scaled_by_the_road() -> None:
     road = (v > 220) & ((u < boxes[0, 0]) | (u > boxes[0, 2]))
     unscaled = DepthMap(depth.depth_m / 7.0, 1242, 375, metric=False)
     metres = in_metres(unscaled, CAMERA, CAMERA.ground, road, CONFIG)
-    assert metres is not None
     assert metres.metric
     np.testing.assert_allclose(np.median(metres.depth_m / depth.depth_m), 1.0, atol=0.01)
     for nothing in (None, np.zeros((375, 1242), bool)):
@@ -135,8 +131,6 @@ def test_unscaled_depth_map_is_scaled_by_the_road() -> None:
         assert locate_in_depth_map(observed(boxes), unscaled, CAMERA, CAMERA.ground, CONFIG, nothing) == [None]
     exact = locate_in_depth_map(observed(boxes), depth, CAMERA, CAMERA.ground, CONFIG)[0]
     scaled = locate_in_depth_map(observed(boxes), unscaled, CAMERA, CAMERA.ground, CONFIG, road)[0]
-    assert exact is not None
-    assert scaled is not None
     np.testing.assert_allclose(scaled.centre_m, exact.centre_m, rtol=0.02)
 
 
@@ -177,7 +171,6 @@ def test_network_gets_boxes_with_points_and_gives_poses_in_ego() -> None:
     near, far = locate_in_depth_map(observed(boxes), depth, CAMERA, CAMERA.ground, config, network=network)
     assert len(network.asked) == 1  # the far one has too few points
     assert far is None
-    assert near is not None
     np.testing.assert_allclose(near.centre_m, [10.0, 2.0], atol=1e-6)
     assert near.yaw_rad == pytest.approx(0.4)
     assert (near.flip, near.size_m) == (0.05, (CAR.length_m, CAR.width_m, CAR.height_m))
@@ -185,7 +178,6 @@ def test_network_gets_boxes_with_points_and_gives_poses_in_ego() -> None:
     assert near.cov[0, 0] == pytest.approx(0.5**2 + (0.05 * depth_m) ** 2)  # its sigma and that of the map
     # One that gives no numbers leaves the fit
     fallback = locate_in_depth_map(observed(boxes), depth, CAMERA, CAMERA.ground, config, network=Told(None))
-    assert fallback[0] is not None
     assert fallback[0].size_m is None
 
 
@@ -199,8 +191,6 @@ def test_bodies_of_the_detector_are_the_second_source() -> None:
     detections = found_with(poses, told(poses))
     seen = observed(detections.boxes_px)[::-1]  # as bodies go with their boxes, the order is of no matter
     measured, (far, near) = locate_detected_bodies(seen, detections, CAMERA, CAMERA.ground, CONFIG)
-    assert near is not None
-    assert far is not None
     np.testing.assert_allclose(near.centre_m, [10.0, 2.0], atol=1e-6)
     np.testing.assert_allclose(far.centre_m, [25.0, -3.0], atol=1e-6)
     assert near.cov[0, 0] == pytest.approx(0.5**2)
@@ -220,7 +210,6 @@ def test_equal_boxes_keep_their_own_bodies() -> None:
     seen = observe_boxes(boxes_px, scores, twice.labels, CAMERA, CAMERA.ground, LOCALISATION)
     assert [o.row for o in seen] == [0]  # one vehicle, by the better score
     _, (found,) = locate_detected_bodies(seen, twice, CAMERA, CAMERA.ground, CONFIG)
-    assert found is not None
     np.testing.assert_allclose(found.centre_m, [10.0, 2.0], atol=1e-6)
 
 
@@ -235,7 +224,6 @@ def test_length_fuses_class_and_body_and_keeps_the_face(
     together_m, of_class_m = seen.dimensions.length_m, CAR.sigma_length_rel * CAR.length_m
     assert min(length_m, CAR.length_m) - 1e-9 <= together_m <= max(length_m, CAR.length_m) + 1e-9
     assert seen.dimensions.sigma_length_rel * together_m == pytest.approx(1 / math.hypot(1 / sigma_m, 1 / of_class_m))
-    assert found is not None
     half_m = 0.5 * abs(math.cos(yaw_rad))
     assert found.centre_m[0] - half_m * together_m == pytest.approx(x_m - half_m * length_m)
 
@@ -306,6 +294,5 @@ def test_depth_and_box_agree_at_equal_depth_and_yaw() -> None:
     depth, boxes = scene([pose], (188, 621))
     (seen,) = observed(boxes)
     found = fit_footprint(seen, depth, CAMERA, CAMERA.ground, PseudoLidarConfig(yaws=90))
-    assert found is not None
     alone = place(seen, math.log(15.0 - 1.96), 0.0, pose.yaw_rad, LOCALISATION)
     assert found.centre_m[1] / found.centre_m[0] == pytest.approx(alone.centre_m[1] / alone.centre_m[0], abs=0.01)

@@ -7,11 +7,9 @@ import os
 import resource
 import signal
 import time
-from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -43,11 +41,11 @@ from birdslam.runtime.recording.recording import (
 )
 from birdslam.runtime.replay.replay import compare
 from birdslam.runtime.supervision.recording_files import choose_file
-from birdslam.runtime.transport.bus import Message
 from birdslam.runtime.wire import Health, Trace, decode, encode
 from birdslam.sources.camera_file import load_camera
 from birdslam.sources.recording import DatasetError
 from birdslam.types import Estimate, Frame, FrameRef, MapUpdate, Measurements, Status
+from tests.fake_bus import FakeBus, Inbox
 from tests.records import new_estimate
 from tests.taped_drive import CAMERA, Tape, measured
 from tests.test_bus import until
@@ -120,8 +118,6 @@ def test_other_readers_of_mcap_find_everything_by_its_index(tape: Tape) -> None:
     with tape.path.open("rb") as file:
         reader = make_reader(file)
         summary = reader.get_summary()
-        assert summary is not None
-        assert summary.statistics is not None
         assert summary.statistics.message_count == len(messages(tape.path))
         assert len(summary.chunk_indexes) > 5
         schemas = {channel.topic: summary.schemas[channel.schema_id].name for channel in summary.channels.values()}
@@ -175,7 +171,6 @@ def test_truncated_recording_is_read_up_to_the_end(tape: Tape) -> None:
     whole = tape.path.read_bytes()
     with tape.path.open("rb") as file:
         summary = make_reader(file).get_summary()
-    assert summary is not None
     first_chunk = summary.chunk_indexes[0].chunk_start_offset  # preceded by the header
     all_of_it = messages(tape.path)
     lengths = []
@@ -199,7 +194,6 @@ def test_a_damaged_chunk_is_left_out_and_counted(tape: Tape) -> None:
     data = bytearray(tape.path.read_bytes())
     with tape.path.open("rb") as file:
         summary = make_reader(file).get_summary()
-    assert summary is not None
     middle = summary.chunk_indexes[4]
     data[middle.chunk_start_offset + middle.chunk_length // 2] ^= 0x10
     tape.path.write_bytes(data)
@@ -238,7 +232,6 @@ def test_a_full_disk_ends_the_recording_with_its_last_whole_chunk(
     for measurements in measured(80):
         tape.step(measurements)
     tape.close()
-    assert tape.writer.error is not None
     assert tape.writer.error.errno == errno.ENOSPC
     assert tape.path.stat().st_size == tape.writer.written_bytes <= 30_000
     verdict = compare(recording := Recording(tape.path))
@@ -428,26 +421,17 @@ def test_recorder_restarts_with_a_new_file_until_the_disk_is_full(
     assert "exists" in capsys.readouterr().err
 
 
-class Backlog:
-    """In the bus's place: as much waits as a recorder finds that had no core for seconds."""
-
-    dropped = malformed = 0
-
-    def __init__(self, waiting: Iterable[Message] = ()) -> None:
-        self._waiting = deque(waiting)
-
-    def __len__(self) -> int:
-        return len(self._waiting)
-
-    def recv(self, timeout_s: float | None = None) -> Message | None:
-        return self._waiting.popleft() if self._waiting else None
+def recorder_of(
+    path: Path, bus: FakeBus, vitals: Vitals | None = None, assignment: Assignment = FIRST
+) -> tuple[Recorder, RecordingWriter]:
+    configuration = Configuration(vehicle="late", camera=CAMERA)
+    writer = RecordingWriter(path, about(configuration, {}), CAMERA, flush_ms=1e-6, sync=False)
+    return Recorder(configuration, bus, writer, vitals or Vitals(), assignment), writer
 
 
 def test_recorder_sends_a_heartbeat_per_message(tmp_path: Path) -> None:
     """Its watchdog leaves out the time without a core, not what it takes to write all that waited meanwhile."""
-    configuration = Configuration(vehicle="late", camera=CAMERA)
-    messages = [Message(FrameRef(**stamps(m)), Trace(), m.t_capture_ns) for m in measured(200)]
-    frames = Backlog(messages)
+    frames = Inbox(FrameRef(**stamps(m)) for m in measured(200))
     written: list[int] = []
     unpacked: list[int] = []
 
@@ -455,15 +439,9 @@ def test_recorder_sends_a_heartbeat_per_message(tmp_path: Path) -> None:
         def beat(self) -> None:
             super().beat()
             written.append(writer.messages)
-            unpacked.append(len(messages) - len(frames) - writer.messages + begun)
+            unpacked.append(200 - len(frames) - writer.messages + begun)
 
-    bus = SimpleNamespace(
-        subscriber=lambda topic, depth, may_drop: frames if topic == "frame" else Backlog(),
-        publisher=lambda topic: SimpleNamespace(put=lambda record: None),
-        on_alive=lambda tell: None,
-    )
-    writer = RecordingWriter(tmp_path / "late.mcap", about(configuration, {}), CAMERA, flush_ms=1e-6, sync=False)
-    recorder = Recorder(configuration, bus, writer, Watched())  # type: ignore[arg-type]
+    recorder, writer = recorder_of(tmp_path / "late.mcap", FakeBus(frame=frames), Watched())
     begun = writer.messages  # the camera's drawing
     assert recorder.record_received(0.0)
     assert writer.messages >= 200
@@ -476,23 +454,14 @@ def test_recorder_sends_a_heartbeat_per_message(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("last", [3, 9])
 def test_measurements_that_are_missing_at_the_end_are_counted(last: int, tmp_path: Path) -> None:
-    configuration = Configuration(vehicle="tail", camera=CAMERA)
     end = new_estimate(**stamps(Frame(9, 9, 9, 9, None)), valid=False, status=(Status.END_OF_SOURCE,))
-    sent: dict[str, list[Any]] = {
-        "measurements": [
-            Measurements(**stamps(Frame(k, k, k, k, None)), status=(Status.END_OF_SOURCE,) if k == 9 else ())
-            for k in range(last + 1)
-        ],
-        "estimate": [end],
-        "map": [MapUpdate(epoch=0, frame_id=9)],
-    }
-    bus = SimpleNamespace(
-        subscriber=lambda topic, depth, may_drop: Backlog(Message(r, Trace(), 1) for r in sent.get(topic, ())),
-        publisher=lambda topic: SimpleNamespace(put=lambda record: None),
-        on_alive=lambda tell: None,
-    )
-    writer = RecordingWriter(tmp_path / "tail.mcap", about(configuration, {}), CAMERA, flush_ms=1e-6, sync=False)
-    recorder = Recorder(configuration, bus, writer, Vitals())  # type: ignore[arg-type]
+    sent = [
+        Measurements(**stamps(Frame(k, k, k, k, None)), status=(Status.END_OF_SOURCE,) if k == 9 else ())
+        for k in range(last + 1)
+    ]
+    gained = Inbox([MapUpdate(epoch=0, frame_id=9)])
+    bus = FakeBus(measurements=Inbox(sent), estimate=Inbox([end]), map=gained)
+    recorder, writer = recorder_of(tmp_path / "tail.mcap", bus)
     while recorder.record_received(0.0):
         pass
     assert recorder.ending
@@ -507,15 +476,8 @@ def test_measurements_that_are_missing_at_the_end_are_counted(last: int, tmp_pat
     ids=["first", "after a confirmed frame", "without a confirmed frame"],
 )
 def test_a_restarted_recorder_counts_the_frames_before_it(tmp_path: Path, assignment: Assignment, missed: int) -> None:
-    configuration = Configuration(vehicle="late", camera=CAMERA)
-    estimates = Backlog([Message(new_estimate(frame_id=12), Trace(), 0)])
-    bus = SimpleNamespace(
-        subscriber=lambda topic, depth, may_drop: estimates if topic == "estimate" else Backlog(),
-        publisher=lambda topic: SimpleNamespace(put=lambda record: None),
-        on_alive=lambda tell: None,
-    )
-    writer = RecordingWriter(tmp_path / "late.mcap", about(configuration, {}), CAMERA, flush_ms=1.0, sync=False)
-    recorder = Recorder(configuration, bus, writer, Vitals(), assignment)  # type: ignore[arg-type]
+    bus = FakeBus(estimate=Inbox([new_estimate(frame_id=12)]))
+    recorder, writer = recorder_of(tmp_path / "late.mcap", bus, assignment=assignment)
     assert recorder.record_received(0.0)
     counts = recorder.end()
     assert counts["missed"] == counts["dropped"] == str(missed)

@@ -118,7 +118,6 @@ def test_the_drive_is_read_back_in_one_plane(results: Path) -> None:
     ]
     assert {kind for kind, _ in drive.lines} == {"solid"}
     assert all(np.abs(xy_m[:, 1] - 1.8).max() < 0.01 for _, xy_m in drive.lines)
-    assert drive.earth is not None
     assert drive.earth.t_s[[0, -1]] == pytest.approx([0.0, 0.1 * (FRAMES - 1)])
     assert drive.earth.at(drive.t_s[[0, 30]]) == pytest.approx(np.array([[49.0, 8.4], [49.0003, 8.4]]), abs=1e-6)
     assert len(drive.earth.tracks_deg) == 2
@@ -163,7 +162,6 @@ def test_the_page_is_complete_offline_and_escaped(results: Path, capsys: pytest.
         assert said in page
     assert '"name":"people"' in page
     taken = re.search(r'download="frames.csv" href="data:text/plain;base64,([^"]*)"', page)
-    assert taken is not None
     assert base64.b64decode(taken[1]) == (results / "frames.csv").read_bytes()
 
 
@@ -204,7 +202,6 @@ def test_a_browser_draws_it_and_the_slider_moves(results: Path, tmp_path: Path, 
     assert int(seen.said["plots"]) >= 4
     assert seen.said["title"].startswith("BirdSLAM: drive")  # what the files hold has run nothing
     picture = cv2.imread(str(tmp_path / "seen.png"))
-    assert picture is not None
     assert picture.std() > 5.0
 
 
@@ -243,7 +240,6 @@ def test_two_clicks_measure_a_length_on_the_road(results: Path, tmp_path: Path) 
         r"Measured: ([\d.]+) m \u00b1 (\d+) %\. For 3 m pass --height ([\d.]+) \(\u00b1 \d+ %\)\.",
         seen.said["measured"],
     )
-    assert measured is not None
     assert float(measured[1]) == pytest.approx(2.0, abs=0.05)  # a click is at a whole pixel
     assert 3 <= int(measured[2]) <= 15
     assert float(measured[3]) == pytest.approx(3.0 / float(measured[1]) * CAMERA.height_m, abs=0.02)

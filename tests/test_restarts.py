@@ -65,8 +65,8 @@ def test_a_restarted_node_resumes_after_the_last_frame(vitals: Vitals) -> None:
 )
 def test_lossless_run_is_not_restarted(rate: object, restart: object, restarts: bool) -> None:
     configuration = Configuration(
-        source=SourceConfig(rate=rate),  # type: ignore[arg-type]
-        runtime=RuntimeConfig(restart=restart),  # type: ignore[arg-type]
+        source=SourceConfig(rate=rate),
+        runtime=RuntimeConfig(restart=restart),
     )
     assert (configuration.restarts, configuration.spares) == (restarts, restarts)
 
@@ -160,7 +160,7 @@ def systemd(tmp_path: Path) -> socket.socket:
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     listener.bind(str(tmp_path / "notify"))
     listener.settimeout(60.0)
-    yield listener  # type: ignore[misc]
+    yield listener
     listener.close()
 
 

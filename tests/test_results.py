@@ -37,8 +37,8 @@ def estimate(frame_id: int, pose: SE2, epoch: int = 0, **fields: object) -> Esti
         t_utc_ns=0,
         T_world_ego=pose,
         cov=COV3,
-        valid=Status.FRAME_UNREADABLE not in fields.get("status", ()),  # type: ignore[operator]
-        **fields,  # type: ignore[arg-type]
+        valid=Status.FRAME_UNREADABLE not in fields.get("status", ()),
+        **fields,
     )
 
 
@@ -252,7 +252,6 @@ def test_picture_shows_trajectory_and_moving_car(tmp_path: Path, monkeypatch: py
         recorder.add(estimate(k, SE2(1.0 * k, 0.0, 0.0), vehicles=seen))
     recorder.finish({})
     image = cv2.imread(str(tmp_path / "bev.png"))
-    assert image is not None
     assert max(image.shape) > 1400
     blue, green, red = (image[..., channel].astype(int) for channel in range(3))
     ego = (blue > 200) & (green > 160) & (red < 90)

@@ -499,7 +499,6 @@ def test_images_of_a_topic_are_a_source_with_their_camera_speed_and_fixes(tmp_pa
 def test_live_drive_is_georeferenced_by_fixes(tmp_path: Path) -> None:
     live = msgspec.structs.replace(configuration(1, tmp_path), camera=CAMERA)
     drive = DriveMap.of(live)
-    assert drive is not None
     for k in range(60):
         told = estimate(k, vehicles=0)
         drive.add(msgspec.structs.replace(told, t_source_ns=k * 10**8, T_world_ego=SE2(float(k), 0.0, 0.0)))

@@ -336,7 +336,6 @@ def test_frames_without_truth_are_named_and_left_out(tmp_path: Path) -> None:
 def test_calibrate_takes_the_lens_of_the_bag_and_the_height_where_it_is_known(tmp_path: Path) -> None:
     none = Given()
     found, height_m = lens_of(none, bag(tmp_path / "drive"), BagTopics())
-    assert found is not None
     assert (found.fx_px, found.width_px, found.source, height_m) == (50.0, WIDTH, CAMERA_INFO, pytest.approx(1.4))
     without = ros.write_bag(tmp_path / "without", [message for message in drive() if message[0] != "/tf_static"])
     assert lens_of(none, f"rosbag:{without}", BagTopics())[1] is None

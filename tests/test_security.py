@@ -180,7 +180,6 @@ def vehicle(tmp_path_factory: pytest.TempPathFactory, certificates: Path) -> Ite
             gate.communicate()
 
         stack.callback(end)
-        assert gate.stdout is not None
         assert "is open" in gate.stdout.readline()
         listeners = {topic: nodes["capture"].subscriber(topic, depth=256) for topic in TOPICS}
         yield Vehicle(base, port, nodes, publishers, listeners)
@@ -242,7 +241,7 @@ def test_planner_sends_only_permitted_queries(vehicle: Vehicle, certificates: Pa
     with outside(certificates, vehicle.port) as session, outside(certificates, vehicle.port, "stranger") as stranger:
         hear(vehicle, session, keys(READABLE))  # each node has a retained message
         for topic in ASKABLE:
-            until(lambda topic=topic: answers(session, topic) == 1, f"an answer about {topic}")  # type: ignore[misc]
+            until(lambda topic=topic: answers(session, topic) == 1, f"an answer about {topic}")
         assert vehicle.nodes["optimize"].retained("measurements", LIMIT_S)  # inside, they are there to be had
         assert answers(session, "measurements", 0.5) == 0
         assert answers(session, "frame", 0.5) == 0
@@ -275,7 +274,7 @@ def test_outsiders_cannot_write(vehicle: Vehicle, certificates: Path) -> None:
         lies = [
             (topic, message.record)
             for topic, listener in vehicle.listeners.items()
-            for message in iter(lambda listener=listener: listener.recv(0.0), None)  # type: ignore[misc]
+            for message in iter(lambda listener=listener: listener.recv(0.0), None)
             if getattr(message.record, "frame_id", getattr(message.record, "t_ns", 0)) == 9_999
         ]
         assert not lies
@@ -343,7 +342,6 @@ def test_the_example_of_a_car(vehicle: Vehicle, certificates: Path, tmp_path: Pa
             text=True,
         )
         try:
-            assert example.stdin is not None
             found: list[SpeedReading] = []
 
             def comes(example: Any = example, found: list[SpeedReading] = found, turn: float | None = turn) -> bool:
@@ -465,7 +463,6 @@ def test_the_example_of_a_planner_elsewhere(vehicle: Vehicle, certificates: Path
         [sys.executable, str(DEPLOY / "listen.py"), str(tmp_path / "planner.json5")], stdout=subprocess.PIPE, text=True
     )
     try:
-        assert listen.stdout is not None
         line = ""
 
         def printed() -> bool:

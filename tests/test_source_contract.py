@@ -99,7 +99,7 @@ def _frames(recording: Recording, start: int = 0) -> list[RecordedFrame]:
 def _same(one: RecordedFrame, other: RecordedFrame) -> bool:
     if (one.index, one.t_source_ns, one.error) != (other.index, other.t_source_ns, other.error):
         return False
-    return one.image is other.image is None or np.array_equal(one.image, other.image)  # type: ignore[arg-type]
+    return one.image is other.image is None or np.array_equal(one.image, other.image)
 
 
 def test_every_kind_of_recording_is_here() -> None:

@@ -110,12 +110,10 @@ def test_a_slow_reader_of_a_camera_gets_the_newest_frame_and_the_count() -> None
         camera.tick.release()
     wait_for(lambda: reader.read == 5)
     item = reader.next(timeout_s=60.0)
-    assert item is not None
     assert (item[0], item[1].t_source_ns) == (4, 5)
     assert reader.dropped == 4
     camera.tick.release()
     item = reader.next(timeout_s=60.0)
-    assert item is not None
     assert item[0] == 5
     reader.close(timeout_s=0.01)
     camera.tick.release()
@@ -164,7 +162,6 @@ def test_frames_are_undistorted() -> None:
     pixels = np.random.default_rng(3).integers(0, 256, (32, 64), dtype=np.uint8)
     frame = to_frame(Undistorter(camera), 0, RecordedFrame(0, 0, pixels), t_capture_ns=0)
     expected = cv2.undistort(pixels, camera.K, np.array(camera.distortion))
-    assert frame.image is not None
     assert np.mean(np.abs(frame.image.astype(int) - expected) <= 2) > 0.99
 
 
@@ -182,7 +179,7 @@ def test_invalid_source_is_refused(overrides: dict[str, str], message: str) -> N
 
 
 def live(uri: str, **source: object) -> Configuration:
-    # type: ignore[arg-type]
+
     return Configuration(camera=CAMERA, source=SourceConfig(uri=uri, camera_timeout_s=1.0, **source))
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections import deque
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -35,11 +34,12 @@ from birdslam.runtime.process.vitals import Vitals
 from birdslam.runtime.recording import scene
 from birdslam.runtime.recording.recording import Recording, RecordingWriter
 from birdslam.runtime.topology import key_of
-from birdslam.runtime.transport.bus import Bus, Message
-from birdslam.runtime.wire import Trace, decode, encode
+from birdslam.runtime.transport.bus import Bus
+from birdslam.runtime.wire import decode, encode
 from birdslam.sources.recording import RecordedFrame
 from birdslam.sources.speed_log import MAX_READINGS, added
 from birdslam.types import EgoEdge, FrameRef, Measurements, SpeedReading, SpeedSource, Status
+from tests.fake_bus import FakeBus, Inbox
 from tests.foreign_sender import foreign_session, matched
 from tests.recordings import SMALL as CAMERA
 from tests.test_bus import until
@@ -52,27 +52,8 @@ def reading(t_ns: int, speed_mps: float = 5.0) -> SpeedReading:
     return SpeedReading(t_ns=t_ns, speed_mps=speed_mps, sigma_mps=0.1)
 
 
-class Inbox:
-    """A subscriber filled by the test, with the topology's depth."""
-
-    malformed = 0
-
-    def __init__(self) -> None:
-        self.dropped = 0
-        self._messages: deque[Message] = deque()
-
-    def come(self, record: msgspec.Struct, t_received_ns: int) -> None:
-        if len(self._messages) == MAX_READINGS:
-            self._messages.popleft()
-            self.dropped += 1
-        self._messages.append(Message(record, Trace(), t_received_ns))
-
-    def recv(self, timeout_s: float | None = None) -> Message | None:
-        return self._messages.popleft() if self._messages else None
-
-
 def test_a_frame_carries_the_last_second_in_order_of_arrival() -> None:
-    inbox = Inbox()
+    inbox = Inbox(depth=MAX_READINGS)
     speeds = CarSpeeds(inbox)
     said = [reading(1), reading(2_000 * MS), reading(3, math.nan), reading(3)]  # any times of the car
     for number, one in enumerate(said):
@@ -85,7 +66,7 @@ def test_a_frame_carries_the_last_second_in_order_of_arrival() -> None:
 def test_a_reading_without_a_time_gets_its_time_of_arrival() -> None:
     """In the source's clock: CLOCK_MONOTONIC for a camera, a separate clock for a paced recording."""
     said = (reading(0), reading(6_990 * MS), reading(-(1 << 63)), reading((1 << 64) - 1))
-    inbox = Inbox()
+    inbox = Inbox(depth=MAX_READINGS)
     for one in said:
         inbox.come(one, 7_000 * MS)
     assert CarSpeeds(inbox).at(7_030 * MS, 7_030 * MS) == (reading(7_000 * MS), *said[1:])
@@ -97,7 +78,7 @@ def test_a_reading_without_a_time_gets_its_time_of_arrival() -> None:
 
 
 def test_a_flood_leaves_the_newest_and_is_counted(caplog: pytest.LogCaptureFixture) -> None:
-    inbox = Inbox()
+    inbox = Inbox(depth=MAX_READINGS)
     speeds = CarSpeeds(inbox)
     for frame in range(1, 4):
         for number in range(5_000):
@@ -157,7 +138,7 @@ def capturing(monkeypatch: pytest.MonkeyPatch, place: Path, bus: Bus, source: So
     configuration = Configuration(
         vehicle="car",
         camera=CAMERA,
-        source=SourceConfig(uri="kitti:none", **settings),  # type: ignore[arg-type]
+        source=SourceConfig(uri="kitti:none", **settings),
         runtime=RuntimeConfig(runtime_dir=str(place)),
     )
     return Capture(CaptureNode(configuration, bus, lambda timeout_s: None, FIRST), source, configuration)
@@ -219,20 +200,10 @@ def test_frames_carry_readings_at_50_hz_despite_malformed_messages(
         assert (health.malformed, health.speeds_dropped) == (5, counters["speeds_dropped"])
 
 
-class FakeBus:
-    """Says which topics somebody has asked for."""
-
-    def __init__(self) -> None:
-        self.inboxes: dict[str, Inbox] = {}
-
-    def subscriber(self, topic: str, depth: int | None = None, may_drop: bool = False) -> Inbox:
-        return self.inboxes.setdefault(topic, Inbox())
-
-
 def test_readings_of_a_recording_override_the_bus(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     own, bus = (reading(0, 7.0),), FakeBus()
     for name, speeds in (("own", own), ("none", ())):
-        node = capturing(monkeypatch, tmp_path / name, bus, Source(False, speeds), rate=1e4)  # type: ignore[arg-type]
+        node = capturing(monkeypatch, tmp_path / name, bus, Source(False, speeds), rate=1e4)
         for frame in range(2):  # the second is torn, and bears them too
             bus.inboxes["speed"].come(reading(3, 3.0), time.monotonic_ns())
             assert node.frame().speeds[-1].speed_mps == (7.0 if own == speeds else 3.0), frame
@@ -244,24 +215,13 @@ def test_a_repeatable_run_ignores_the_bus(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, settings: dict[str, object]
 ) -> None:
     bus = FakeBus()
-    node = capturing(monkeypatch, tmp_path, bus, Source(False, (reading(4),)), **settings)  # type: ignore[arg-type]
+    node = capturing(monkeypatch, tmp_path, bus, Source(False, (reading(4),)), **settings)
     assert node.frame().speeds == (reading(4),)
     assert "speed" not in bus.inboxes
     node.close()
 
 
 # --- in a recording ---
-
-
-class RecorderBus(FakeBus):
-    """Also lets the recorder report its health."""
-
-    def publisher(self, topic: str) -> RecorderBus:
-        return self
-
-    def put(self, record: msgspec.Struct) -> None: ...
-
-    def on_alive(self, callback: object) -> None: ...
 
 
 @given(st.lists(st.integers(0, 3), max_size=12), st.data())
@@ -280,8 +240,8 @@ def test_recording_restores_the_readings_of_frames(tmp_path: Path) -> None:
     path = tmp_path / "drive.mcap"
     recorded = Configuration(recording=RecordingConfig(file=str(path), images=True), camera=CAMERA)
     writer = RecordingWriter(path, about(recorded, {}), CAMERA, flush_ms=1e-3, sync=False)
-    bus = RecorderBus()
-    recorder = Recorder(Configuration(), bus, writer, Vitals())  # type: ignore[arg-type]
+    bus = FakeBus()
+    recorder = Recorder(Configuration(), bus, writer, Vitals())
     refs = []
     said = tuple(reading(n * 10 * MS, math.nan if n % 7 == 3 else float(n)) for n in range(30))
     for number in range(6):
@@ -296,7 +256,7 @@ def test_recording_restores_the_readings_of_frames(tmp_path: Path) -> None:
     writer.close({})
 
     def borne(**settings: object) -> list[bytes]:
-        # type: ignore[arg-type]
+
         source = open_source(Configuration(source=SourceConfig(uri=f"mcap:{path}", **settings)))
         times = {"t_source_ns": 0, "t_capture_ns": 0, "t_utc_ns": 0}
         return [encode(FrameRef(frame_id=f.index, speeds=f.speeds, **times)) for f in source.frames()]

@@ -27,7 +27,7 @@ probabilities = st.floats(0.0, 1.0)
 
 
 def node(standing_seen: float | None, **more: object) -> VehicleNode:
-    return VehicleNode(1, seen_ns=7, standing_seen=standing_seen, **more)  # type: ignore[arg-type]
+    return VehicleNode(1, seen_ns=7, standing_seen=standing_seen, **more)
 
 
 def judged(vehicle: VehicleNode, v_mps: tuple[float, float], sigma_mps: float) -> VehicleNode:
@@ -67,7 +67,6 @@ def test_covariance_is_that_of_the_mixture_about_the_reported_velocity(
 def test_new_vehicle_is_undecided_with_velocity_pulled_to_zero() -> None:
     new = judged(node(0.4), (6.0, 0.0), 6.0)
     assert new.moves is Moves.UNDECIDED
-    assert new.standing is not None
     assert 0.2 < new.standing < 0.8
     u, C = reported(new, (6.0, 0.0), 36.0 * np.eye(2))
     assert u[0] < 6.0 * (1.0 - new.standing) + 1e-9
@@ -85,8 +84,6 @@ def test_vehicle_beside_the_road_needs_more_evidence_of_motion() -> None:
     for standing_seen, v_mps in ((0.2, 2.5), (0.4, 1.5)):
         on_road = judged(node(standing_seen), (v_mps, 0.0), 1.0)
         beside = judged(node(standing_seen, beside=True), (v_mps, 0.0), 1.0)
-        assert on_road.standing is not None
-        assert beside.standing is not None
         assert beside.standing > on_road.standing
     assert judged(node(0.005, beside=True), (9.0, 0.0), 0.5).moves is Moves.DRIVING
 

@@ -148,7 +148,5 @@ def test_front_end_holds_the_road_of_a_stopped_ego() -> None:
         detections[k] = Detections(np.array(boxes), np.full(len(boxes), 0.9), ("car",) * len(boxes))
     log = measure(sequence, detections, FrontEndConfig())
     halted, last = log[stands_from + 1].ground, log[-1].ground
-    assert halted is not None
-    assert last is not None
     assert halted.pitch_rad == pytest.approx(pitch_rad, abs=0.006)
     assert last.pitch_rad == pytest.approx(halted.pitch_rad, abs=1e-6)

@@ -187,7 +187,6 @@ def test_position_from_depth_is_weighted_by_covariance() -> None:
         tracks: list[VehicleTrack] = []
         for k in range(6):
             box = box_px(SE2(25.0, 1.0, 0.0))
-            assert box is not None
             seen = observe_boxes(
                 box[None], np.full(1, 0.9), ("car",), CAMERA, drive.ground_size.ground, LocalisationConfig()
             )
@@ -248,7 +247,6 @@ class Looks:
 
     def see(self, at: SE2, said_rad: float, flip: float = 0.05, sigma_rad: float = 0.1) -> VehicleTrack | None:
         box = box_px(at)
-        assert box is not None
         seen = observe_boxes(
             box[None], np.array([0.9]), ("car",), CAMERA, self.drive.ground_size.ground, LocalisationConfig()
         )
@@ -265,7 +263,6 @@ def test_heading_of_a_never_moving_car_is_the_observed_one(yaw_rad: float) -> No
     rng = np.random.default_rng(0)
     for _ in range(30):
         track = looks.see(SE2(14.0, 1.0, yaw_rad), wrap(yaw_rad + 0.1 * rng.standard_normal()))
-    assert track is not None
     assert abs(wrap(track.yaw_rad - yaw_rad)) < 0.1
     assert track.is_yaw_known
     assert track.sigma_yaw_rad < 0.15
@@ -287,7 +284,6 @@ def test_axis_without_front_keeps_the_ego_heading() -> None:
     looks, track = Looks(), None
     for _ in range(5):
         track = looks.see(SE2(14.0, 1.0, 0.0), 1.0, flip=0.5)
-    assert track is not None
     assert track.yaw_rad == 0.0
     assert not track.is_yaw_known
 
@@ -296,7 +292,6 @@ def test_motion_determines_the_front() -> None:
     looks, track = Looks(), None
     for k in range(25):
         track = looks.see(SE2(40.0 - 1.0 * k, 3.0, math.pi), 0.05, flip=0.3)  # it comes, and looks as if it went
-    assert track is not None
     assert abs(wrap(track.yaw_rad - math.pi)) < 0.2
 
 

@@ -88,11 +88,9 @@ def test_an_exact_world_has_hardly_any_error(sequence: TrackingSequence, exact_l
     assert trial.frames_labelled[EGO] == len(FRAMES)
     for name in ("birdslam", "nair", "cubeslam", "namdev"):
         ego = trial.errors[name][EGO]
-        assert ego is not None
         assert ego.ate_m < 0.05, name
     for car in ("3", "7", "9"):
         errors = trial.errors["birdslam"][car]
-        assert errors is not None
         assert errors.ate_m < 0.8, car
         assert errors.frames >= trial.frames_labelled[car] - 4  # a track is confirmed by its third sight
 
@@ -229,7 +227,6 @@ def test_the_weight_of_landmarks_is_against_that_of_the_odometry(noisy_log: list
     record = next(m for m in noisy_log if m.cp and m.cc)
     for name, factor in ablation.CP_WEIGHTS.items():
         believed = weighted(record, paper[name].weights)
-        assert believed.cc is not None
         assert believed.cp[0].cov[0] * factor == pytest.approx(believed.cc.cov[0])
         assert own[name].cp_inflation == pytest.approx(1.0 / factor)
 
@@ -266,7 +263,7 @@ def test_the_simulated_odometry_errs_as_it_says() -> None:
     motions = [odometry.estimate(None, k, k, np.zeros((0, 4))) for k in range(400)]
     assert motions[0] is None
     steps = np.array([[m.T_prev_curr.x_m, m.T_prev_curr.y_m, m.T_prev_curr.yaw_rad] for m in motions if m])
-    sigma = np.sqrt(np.diag(motions[1].cov))  # type: ignore[union-attr]
+    sigma = np.sqrt(np.diag(motions[1].cov))
     ratio = (steps - [1.2, 0.0, 0.0]).std(axis=0) / sigma
     assert (ratio > 0.6).all()
     assert (ratio < 1.4).all()

@@ -31,7 +31,6 @@ def test_errors_are_those_of_the_frames_that_both_have() -> None:
     truth = {k: SE2(float(k)) for k in range(6)}
     found = {k: SE2(k + (1.0 if k > 2 else 0.0)) for k in range(6) if k != 2}  # it jumps where it was not seen
     errors = path_errors(truth, found)
-    assert errors is not None
     assert errors.frames == 5
     assert errors.ate_m == pytest.approx(math.sqrt(3.0 / 5.0))
     assert path_errors(truth, {}) is None

@@ -134,7 +134,6 @@ def test_viewer_starts_in_a_browser_without_other_hosts(tmp_path: Path) -> None:
         said: list[str] = []
         with subprocess.Popen([program, *options, viewer.page], stderr=subprocess.PIPE, text=True) as browser:
             try:
-                assert browser.stderr is not None
                 for line in browser.stderr:
                     said += [line] if "CONSOLE" in line else []
                     if "App started" in line:

@@ -34,7 +34,6 @@ def test_workers_end_with_a_process_that_is_killed(how: signal.Signals, tmp_path
     script.write_text(BUSY)
     process = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
-        assert process.stdout is not None
         begun = {process.stdout.readline() for _ in range(2)}
         assert begun == {"task 0 begun\n", "task 1 begun\n"}
         process.send_signal(how)

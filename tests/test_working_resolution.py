@@ -56,7 +56,6 @@ def test_scaled_image_keeps_relative_positions() -> None:
     v, u = (float(at.mean()) for at in np.nonzero(small > 100))
     np.testing.assert_allclose(resolution.original_px(np.array([[u, v]])), [[819.5, 419.5]], atol=1.0)
     mask = resolution.mask(image > 0)
-    assert mask is not None
     assert mask.sum() == 400
     with pytest.raises(ValueError, match="640x360"):
         resolution.image(np.zeros((360, 640), np.uint8))
