@@ -6,6 +6,7 @@ import base64
 import dataclasses
 import json
 import re
+import shutil
 from pathlib import Path
 
 import cv2
@@ -38,9 +39,14 @@ EVIL = "</script><script>document.title='broken'</script>"
 
 
 @pytest.fixture
-def results(tmp_path: Path) -> Path:
+def results(recorded: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(recorded, tmp_path / recorded.name))
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A drive of 60 frames at 10 Hz and 5 m/s: it starts without a scale, and restarts at frame 40."""
-    directory = tmp_path / "drive & <b>way"
+    directory = tmp_path_factory.mktemp("recorded") / "drive & <b>way"
     with Recorder(directory, CAMERA) as recorder:
         for k in range(FRAMES):
             status: tuple[Status, ...] = (Status.SCALE_INVALID,) if k < 10 else ()
