@@ -55,17 +55,17 @@ def _sample(seed: int, a_m: np.ndarray, b_m: np.ndarray, footprint_m: np.ndarray
     level = np.clip(np.log2(np.maximum(footprint_m / 0.02, 1.0)), 0.0, 4.99)
     out = np.zeros(a_m.shape, np.float32)
     for k, image in enumerate(_texture(seed)):
-        share = np.maximum(1.0 - np.abs(level - k), 0.0).astype(np.float32)
-        (seen,) = np.nonzero(share)
-        side, texel = image.shape[0] - 1, 0.02 * 2**k
-        rows = -(-len(seen) // WIDTH_PX)  # remap takes an image of points
-        u, v = np.zeros((2, rows * WIDTH_PX), np.float32)
-        for to, x in ((u, a_m), (v, b_m)):
-            to[: len(seen)] = side - np.abs(x[seen] / texel % (2 * side) - side)
-        if rows:
-            texels = cv2.remap(image, u.reshape(rows, -1), v.reshape(rows, -1), cv2.INTER_LINEAR)
-            out[seen] += share[seen] * texels.ravel()[: len(seen)]
+        seen = np.flatnonzero(np.abs(level - k) < 1.0)
+        if len(seen):
+            at = np.zeros((2, -(-len(seen) // WIDTH_PX), WIDTH_PX), np.float32)  # remap takes an image of points
+            at.reshape(2, -1)[:, : len(seen)] = np.array([a_m[seen], b_m[seen]]) / (0.02 * 2**k)
+            texels = cv2.remap(image, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+            out[seen] += (1.0 - np.abs(level[seen] - k)) * texels.ravel()[: len(seen)]
     return out
+
+
+_V, _U = np.mgrid[0:HEIGHT_PX, 0:WIDTH_PX].reshape(2, -1)
+RAYS = np.array([(_U - CAMERA.cx_px) / CAMERA.fx_px, (_V - CAMERA.cy_px) / CAMERA.fy_px, np.ones(_U.shape)])
 
 
 def render(pose: Pose, noise_seed: int = 0) -> np.ndarray:
@@ -75,28 +75,26 @@ def render(pose: Pose, noise_seed: int = 0) -> np.ndarray:
 
 @functools.lru_cache(maxsize=256)  # a common start of drives
 def _rendered(R: bytes, p_m: bytes, noise_seed: int) -> np.ndarray:
-    pose = Pose(np.frombuffer(R).reshape(3, 3), np.frombuffer(p_m))
-    v, u = np.mgrid[0:HEIGHT_PX, 0:WIDTH_PX].astype(np.float64)
-    rays = np.stack([(u - CAMERA.cx_px) / CAMERA.fx_px, (v - CAMERA.cy_px) / CAMERA.fy_px, np.ones_like(u)], -1)
-    d, p = rays @ pose.R.T, pose.p
+    p, d = np.frombuffer(p_m), np.frombuffer(R).reshape(3, 3).copy() @ RAYS
     with np.errstate(divide="ignore", invalid="ignore"):
-        road = np.where(d[..., 1] > 1e-4, (1.65 - p[1]) / d[..., 1], np.inf)
-        wall = np.where(d[..., 0] > 0, (7.0 - p[0]) / d[..., 0], (-6.0 - p[0]) / d[..., 0])
-    wall = np.where(np.isfinite(wall) & (wall > 0), wall, np.inf)
-    front = np.where(d[..., 2] > 1e-3, (90.0 - p[2]) / d[..., 2], np.inf)
-    depth = np.minimum(np.minimum(road, wall), front)
-    hit = p + depth[..., None] * d
-    hit[~np.isfinite(hit)] = 0.0
-    image = np.full(u.shape, 210.0, np.float32)  # sky
-    footprint = np.minimum(depth, 100.0) / CAMERA.fx_px
-    on_road, on_wall = depth == road, (depth == wall) & (hit[..., 1] > -5.0)
-    on_front = (depth == front) & (hit[..., 1] > -6.0)
-    x_m, y_m, z_m = np.moveaxis(hit, -1, 0)
-    image[on_front] = _sample(3, x_m[on_front], y_m[on_front], footprint[on_front])
-    image[on_wall] = _sample(2, z_m[on_wall], y_m[on_wall], footprint[on_wall] * 2)
-    image[on_road] = 0.6 * _sample(1, x_m[on_road], z_m[on_road], footprint[on_road] * 4) + 30.0
-    image += np.random.default_rng(noise_seed).normal(0.0, 1.5, image.shape)
-    return np.clip(image, 0, 255).astype(np.uint8)
+        road = np.where(d[1] > 1e-4, (1.65 - p[1]) / d[1], np.inf)
+        wall = (np.where(d[0] > 0.0, 7.0, -6.0) - p[0]) / d[0]
+        wall[~(wall > 0.0)] = np.inf
+        front = np.where(d[2] > 1e-3, (90.0 - p[2]) / d[2], np.inf)
+        depth = np.minimum(np.minimum(road, wall), front)
+        y_m = p[1] + depth * d[1]
+    image = np.full(depth.shape, 210.0, np.float32)  # sky
+    for surface, highest_m, (a, b), seed, blur in (
+        (front, -6.0, (0, 1), 3, 1.0),
+        (wall, -5.0, (2, 1), 2, 2.0),
+        (road, -np.inf, (0, 2), 1, 4.0),
+    ):
+        at = np.flatnonzero((depth == surface) & (y_m > highest_m))
+        a_m, b_m = (p[axis] + depth[at] * d[axis, at] for axis in (a, b))
+        texels = _sample(seed, a_m, b_m, blur * np.minimum(depth[at], 100.0) / CAMERA.fx_px)
+        image[at] = 0.6 * texels + 30.0 if surface is road else texels
+    noise = np.random.default_rng(noise_seed).normal(0.0, 1.5, (HEIGHT_PX, WIDTH_PX))
+    return np.clip(image.reshape(noise.shape) + noise, 0, 255).astype(np.uint8)
 
 
 def street(steps: Iterable[tuple[float, float]]) -> list[Pose]:
@@ -396,13 +394,11 @@ def test_late_masks_change_length_within_sigma(seed: int) -> None:
     """Masks of a road that bends: of each frame; then of some frames before or none, as the networks' time has it."""
     truth = street([(0.35, 0.003 * math.sin(k / 6.0)) for k in range(40)])
     images = [render(pose, k) for k, pose in enumerate(truth)]
-    v, u = np.mgrid[0:HEIGHT_PX, 0:WIDTH_PX]
-    rays = np.stack([(u - CAMERA.cx_px) / CAMERA.fx_px, (v - CAMERA.cy_px) / CAMERA.fy_px, np.ones(u.shape)], -1)
     masks: list[np.ndarray | None] = []
     for pose in truth:  # road no farther to the side than 3 m
-        d = rays @ pose.R.T
-        aside_m = pose.p[0] + d[..., 0] / np.maximum(d[..., 1], 1e-4) * 1.65
-        masks.append((d[..., 1] > 1e-2) & (np.abs(aside_m) < 3.0))
+        d = pose.R @ RAYS
+        aside_m = pose.p[0] + d[0] / np.maximum(d[1], 1e-4) * 1.65
+        masks.append(((d[1] > 1e-2) & (np.abs(aside_m) < 3.0)).reshape(HEIGHT_PX, WIDTH_PX))
 
     def driven(late: list[np.ndarray | None]) -> tuple[float, float]:
         """The length in metres and its relative sigma at the end."""

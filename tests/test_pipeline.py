@@ -303,7 +303,7 @@ def test_real_frames_and_networks_too(data_dir: Path, models_dir: Path, place: P
 
 
 def test_a_slow_reader_costs_dropped_frames_that_are_counted(drive: Path, place: Path) -> None:
-    count = 3000  # three seconds: perceive sees several frames even if its first one takes long
+    count = 1500  # perceive sees several frames even if its first one takes long
     run = run_all(place, drive, "--rate", "1000", "--set", "source.loop=true", "--set", f"source.frames={count}")
     summary = run.summary()
     assert summary["frames_in"] == count
