@@ -15,9 +15,9 @@ from birdslam.bench.baselines.trajectories import LiveTrajectories, Trajectories
 from birdslam.geometry.se2 import SE2
 from birdslam.perf.latency import optimizer
 from birdslam.perf.latency.drive import Drive, DriveConfig, drive
-from birdslam.types import EgoEdge, Estimate, Measurements, VehicleEdge
+from birdslam.types import Estimate, Measurements, VehicleEdge
 from tests.recordings import KITTI as CAMERA
-from tests.records import new_estimate
+from tests.records import new_estimate, step_at
 
 QUIET = DriveConfig(frames=40, rate_hz=10.0, vehicles=3, landmarks=8, lane_points=0, noise=0.0)
 HEIGHT_M = 1.5
@@ -167,8 +167,7 @@ def test_namdev_estimates_the_scale_from_a_stationary_car() -> None:
         column_px, foot_px = CAMERA.cx_px - CAMERA.fx_px * T.y_m / T.x_m, CAMERA.fy_px * HEIGHT_M / T.x_m
         box_px = (column_px - 5.0, 0.0, column_px + 5.0, foot_px)
         seen = VehicleEdge(vehicle=1, frame=k, T_ego_vehicle=T, cov=UNIT, box_px=box_px)
-        moved = EgoEdge(from_frame=k - 1, to_frame=k, T_from_to=steps[k - 1], cov=UNIT) if k else None
-        log.append(Measurements(frame_id=k, t_source_ns=k, t_capture_ns=k, t_utc_ns=k, cc=moved, cv=(seen,)))
+        log.append(step_at(k, steps[k - 1], 1.0, t_source_ns=k, cv=(seen,)))
         ego = ego @ step
     config = namdev.NamdevConfig(start_height_m=2.5, sigma_height_m=1.0, sigma_depth_rel=0.001)
     poses = namdev.run(log, CAMERA, config).vehicles[1]

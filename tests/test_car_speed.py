@@ -20,8 +20,8 @@ from birdslam.odometry.road.kalman_filter import CAR_DELAY, CAR_FACTOR, STATES, 
 from birdslam.odometry.scale_config import RoadScaleConfig
 from birdslam.odometry.speed.readings import CarSpeedConfig, SpeedReadings
 from birdslam.odometry.speed.scale import SpeedScale
-from birdslam.types import INVALIDATING, NS_PER_S, EgoEdge, Measurements, SpeedReading, SpeedSource, Status
-from tests.records import new_measurements
+from birdslam.types import INVALIDATING, NS_PER_S, Measurements, SpeedReading, SpeedSource, Status
+from tests.records import step_at
 from tests.test_odometry import CAMERA, NO_BOXES, path_m, render, street
 
 Speed = Callable[[float], float]
@@ -353,11 +353,9 @@ def test_guessed_turn_is_used_briefly_without_new_epoch() -> None:
 
     def moved(frame: int) -> Measurements:
         by_car = 5 <= frame < 15
-        edge = EgoEdge(from_frame=frame - 1, to_frame=frame, T_from_to=SE2(1.0, 0.0, 0.0), cov=(0.0,) * 9)
-        return new_measurements(
-            frame_id=frame,
-            t_source_ns=frame * NS_PER_S // 10,
-            cc=edge,
+        return step_at(
+            frame,
+            SE2(1.0),
             status=(Status.ODOMETRY_COASTING,) if by_car else (),
             speed_sources=(SpeedSource.CAR,) if by_car else (SpeedSource.ROAD,),
         )

@@ -20,9 +20,10 @@ from birdslam.odometry.road.fit import RoadFit
 from birdslam.odometry.road.kalman_filter import RoadFilter
 from birdslam.odometry.scale_config import RoadScaleConfig
 from birdslam.perf.latency.drive import Drive, DriveConfig, drive
-from birdslam.types import EgoEdge, Estimate, Measurements, VehicleEdge
+from birdslam.types import Estimate, Measurements, VehicleEdge
 from tests.batch_se2 import Solution, ego_key, solve, vehicle_key
 from tests.recordings import KITTI as CAMERA
+from tests.records import step_at
 
 ALL_EDGES = WeightsConfig(leave_out=())
 EQ_6 = GraphConfig(
@@ -142,13 +143,9 @@ def test_a_yaw_that_turns_out_to_be_another_one_leaves_the_place_where_it_is(tur
         return VehicleEdge(vehicle=0, frame=frame, T_ego_vehicle=T, cov=tuple(cov.ravel().tolist()))
 
     graph = PoseGraph(GraphConfig(), WeightsConfig())
-    standing = (1e-8, 0.0, 0.0, 0.0, 1e-8, 0.0, 0.0, 0.0, 1e-8)
     for k in range(30):
-        cc = EgoEdge(from_frame=k - 1, to_frame=k, T_from_to=SE2(), cov=standing) if k else None
-        t_ns = k * 100_000_000
         yaw_rad = place.yaw_rad if k < 5 else place.yaw_rad + turn_rad
-        m = Measurements(frame_id=k, t_source_ns=t_ns, t_capture_ns=t_ns, t_utc_ns=t_ns, cc=cc, cv=(sight(k, yaw_rad),))
-        estimate = graph.optimise(m).vehicles[0]
+        estimate = graph.optimise(step_at(k, SE2(), 1e-8, cv=(sight(k, yaw_rad),))).vehicles[0]
         away = np.hypot(estimate.T_world_vehicle.x_m - place.x_m, estimate.T_world_vehicle.y_m - place.y_m)
         assert away < 0.02
     assert abs(estimate.T_world_vehicle.yaw_rad - place.yaw_rad - turn_rad) < 0.5 * abs(turn_rad)

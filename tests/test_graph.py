@@ -31,7 +31,8 @@ from birdslam.perf.__main__ import main as perf_main
 from birdslam.perf.latency import optimizer
 from birdslam.perf.latency.drive import Drive, DriveConfig, drive
 from birdslam.perf.latency.optimizer import CONTENDERS
-from birdslam.types import EgoEdge, Estimate, LandmarkEdge, LanePoint, Measurements, Status
+from birdslam.types import Estimate, LandmarkEdge, LanePoint, Measurements, Status
+from tests.records import step_at
 
 ALL_EDGES = WeightsConfig(leave_out=())
 EQ_6 = GraphConfig(
@@ -93,19 +94,10 @@ SCALE_ALONE = GraphConfig(correlated_direction_rad=0.0, correlated_turn_rel=0.0)
 
 def chain(steps: Iterable[SE2], scale_sigma_rel: float) -> list[Measurements]:
     """A drive whose odometry states no noise."""
-    out = []
-    for k, step in enumerate([SE2(), *steps]):
-        cc = None
-        if k:
-            exact = tuple(np.eye(3).ravel() * 1e-12)
-            cc = EgoEdge(from_frame=k - 1, to_frame=k, T_from_to=step, cov=exact)
-        t_ns = k * 30_000_000
-        out.append(
-            Measurements(
-                frame_id=k, t_source_ns=t_ns, t_capture_ns=t_ns, t_utc_ns=t_ns, cc=cc, scale_sigma_rel=scale_sigma_rel
-            )
-        )
-    return out
+    return [
+        step_at(k, step, 1e-12, t_source_ns=k * 30_000_000, scale_sigma_rel=scale_sigma_rel)
+        for k, step in enumerate([SE2(), *steps])
+    ]
 
 
 def wander(steps: int, step_m: float, sigma: float, rng: np.random.Generator) -> list[float]:

@@ -16,7 +16,8 @@ from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig, weighted
 from birdslam.lanes.amodal.lane_edges import LaneEdgesConfig, Station, fit_stations, lane_stations
-from birdslam.types import EgoEdge, Estimate, LandmarkEdge, LandmarkKind, Measurements
+from birdslam.types import Estimate, LandmarkEdge, LandmarkKind, Measurements
+from tests.records import step_at
 
 CONFIG = LaneEdgesConfig()
 CAMERA = Camera(
@@ -87,12 +88,10 @@ def drive(seed: int, edges: bool, weights: WeightsConfig, frames: int = 120) -> 
     step, sigma = SE2(1.0, 0.0, 0.004), np.array([0.02, 0.02, 0.001])
     errors, nees = [], []
     for k in range(frames):
-        cc, cp = None, ()
+        noisy, cp = None, ()
         if k:
             noisy = step @ SE2(*(rng.standard_normal(3) * sigma).tolist())
             truth, odometry = truth @ step, odometry @ noisy
-            cov = tuple(np.diag(sigma**2).ravel().tolist())
-            cc = EgoEdge(from_frame=k - 1, to_frame=k, T_from_to=noisy, cov=cov)
         if edges and k:
             # Both lines are seen from where the ego truly is, with an error of height and pitch common to the frame
             common_m, own_m = rng.standard_normal(), rng.standard_normal(2) * CONFIG.sigma_across_m
@@ -105,9 +104,7 @@ def drive(seed: int, edges: bool, weights: WeightsConfig, frames: int = 120) -> 
                 near[:, 1] += own_m[lane] + 0.02 * common_m * aside_m
                 seen += [s.edge(k, odometry) for s in found(odometry, near, lane)]
             cp = tuple(seen)
-        estimate = graph.optimise(
-            Measurements(frame_id=k, t_source_ns=k * 10**8, t_capture_ns=0, t_utc_ns=0, cc=cc, cp=cp)
-        )
+        estimate = graph.optimise(step_at(k, noisy, cov=tuple(np.diag(sigma**2).ravel().tolist()), cp=cp))
         if k:
             e = np.array((estimate.T_world_ego.between(truth)).log())
             errors.append(math.hypot(e[0], e[1]))
@@ -141,14 +138,11 @@ def test_station_and_road_point_with_equal_id_are_distinct() -> None:
     def estimates(station_id: int) -> list[Estimate]:
         graph, out = PoseGraph(GraphConfig(ego_nodes=1), ALL_EDGES), []
         for k in range(4):
-            cov = tuple(np.diag([1e-2] * 3).ravel().tolist())
-            cc = EgoEdge(from_frame=k - 1, to_frame=k, T_from_to=SE2(1.0), cov=cov) if k else None
             corner = LandmarkEdge(landmark=7, frame=k, x_m=9.1 - k, y_m=1.0, cov=(0.01, 0.0, 0.0, 0.01))
             station = LandmarkEdge(
                 landmark=station_id, frame=k, x_m=7.0 - k, y_m=-1.0, cov=(0.01, 0.0, 0.0, 0.01), kind=LandmarkKind(1)
             )
-            m = Measurements(frame_id=k, t_source_ns=k * 10**8, t_capture_ns=0, t_utc_ns=0, cc=cc, cp=(corner, station))
-            out.append(graph.optimise(m))
+            out.append(graph.optimise(step_at(k, SE2(1.0), 1e-2, cp=(corner, station))))
         assert len(graph.factors[-1]) == 2
         return out
 
@@ -158,11 +152,9 @@ def test_station_and_road_point_with_equal_id_are_distinct() -> None:
 def test_lane_is_not_a_landmark_on_the_map() -> None:
     graph = PoseGraph(GraphConfig(ego_nodes=1, landmark_least_frames=1), ALL_EDGES)
     for k in range(6):
-        cov = tuple(np.diag([1e-4] * 3).ravel().tolist())
-        cc = EgoEdge(from_frame=k - 1, to_frame=k, T_from_to=SE2(1.0), cov=cov) if k else None
         corner = LandmarkEdge(landmark=7, frame=k, x_m=9.0 - k, y_m=1.0, cov=(0.1, 0.0, 0.0, 0.1))
         lanes = tuple(s.edge(k, SE2(float(k))) for s in found(SE2(float(k)), line(0.0, 1.0)))
         cp = (corner, *lanes) if k < 3 else ()
-        graph.optimise(Measurements(frame_id=k, t_source_ns=k * 10**8, t_capture_ns=0, t_utc_ns=0, cc=cc, cp=cp))
+        graph.optimise(step_at(k, SE2(1.0), 1e-4, cp=cp))
     gained = graph.map_update()
     assert len(gained.landmarks_m) == 1

@@ -15,7 +15,7 @@ from birdslam.graph.factors.lasting_error import lasting_correlation, line_of_si
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
-from birdslam.types import EgoEdge, Measurements, VehicleEdge
+from tests.records import new_edge, step_at
 
 SIGMAS_M = np.array([2.0, 0.3])  # along the line of sight, and across
 EXACT = tuple(np.diag([1e-8, 1e-8, 1e-10]).ravel().tolist())
@@ -54,13 +54,10 @@ def test_error_is_fully_correlated_without_change(
 def variances(frames: int, ego_mps: float, config: GraphConfig) -> Floats:
     """(2,) of a standing vehicle's place along and across the line of sight, seen in so many frames at 10 Hz."""
     graph = PoseGraph(config, WeightsConfig())
-    cov = tuple(np.diag([*np.square(SIGMAS_M), 0.01]).ravel().tolist())
     for k in range(frames):
-        t_ns, step = round(1e8 * k), SE2(ego_mps / 10.0)
-        cc = EgoEdge(from_frame=k - 1, to_frame=k, T_from_to=step, cov=EXACT) if k else None
-        cv = VehicleEdge(vehicle=1, frame=k, T_ego_vehicle=SE2(60.0 - k * step.x_m), cov=cov)
-        record = Measurements(frame_id=k, t_source_ns=t_ns, t_capture_ns=t_ns, t_utc_ns=t_ns, cc=cc, cv=(cv,))
-        (vehicle,) = graph.optimise(record).vehicles
+        step = SE2(ego_mps / 10.0)
+        seen = new_edge(1, k, SE2(60.0 - k * step.x_m), (*np.square(SIGMAS_M).tolist(), 0.01))
+        (vehicle,) = graph.optimise(step_at(k, step, cov=EXACT, cv=(seen,))).vehicles
     return np.diag(np.reshape(vehicle.cov, (3, 3)))[:2]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -14,7 +13,8 @@ from birdslam.bench.ego.motion_consistency import MotionConsistency, Motions, Ne
 from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.trajectory import ego_pose, inverse, mount_pose
-from birdslam.types import Attitude, EgoEdge, Measurements, Status
+from birdslam.types import Attitude, Measurements, Status
+from tests.records import step_at
 
 MOUNT = GroundPlane(height_m=1.6, pitch_rad=0.05, roll_rad=-0.02)
 COV = np.array([[4e-4, 1e-5, 0.0], [1e-5, 1e-4, 2e-6], [0.0, 2e-6, 1e-6]])
@@ -38,12 +38,7 @@ def town(frames: int, rng: np.random.Generator) -> list[SE2]:
 
 
 def measurements(frame: int, step: SE2 | None, cov: NDArray[np.float64], **fields: object) -> Measurements:
-    t_ns = frame * 100_000_000
-    edge = None
-    if step is not None:
-        edge = EgoEdge(from_frame=frame - 1, to_frame=frame, T_from_to=step, cov=tuple(cov.ravel().tolist()))
-    plain = Measurements(frame_id=frame, t_source_ns=t_ns, t_capture_ns=t_ns, t_utc_ns=t_ns, cc=edge)
-    return msgspec.structs.replace(plain, **fields)
+    return step_at(frame, step, cov=tuple(cov.ravel().tolist()), **fields)
 
 
 def told(steps: list[SE2], cov: NDArray[np.float64]) -> Motions:

@@ -36,7 +36,6 @@ from birdslam.road_users.state.ground_size_filter import GroundSizeFilter
 from birdslam.road_users.track import EgoFrame, TrackingConfig
 from birdslam.types import (
     FIRST_PERSON,
-    EgoEdge,
     Estimate,
     FollowedPerson,
     Ground,
@@ -46,6 +45,7 @@ from birdslam.types import (
     Status,
 )
 from tests.recordings import KITTI as CAMERA
+from tests.records import step_at
 
 BOXES = (LocalisationConfig(),)
 Box = tuple[float, float, float, float]
@@ -352,15 +352,8 @@ def test_skipped_frames_only_grow_the_covariance() -> None:
 
 
 def measured(frame: int, people: tuple[FollowedPerson, ...], ahead_m: float = 0.5, **fields: object) -> Measurements:
-    cc = None if frame == 0 else EgoEdge(
-        from_frame=frame - 1, to_frame=frame, T_from_to=SE2(ahead_m, 0.0, 0.0),
-        cov=(1e-4, 0.0, 0.0, 0.0, 1e-4, 0.0, 0.0, 0.0, 1e-6),
-    )  # fmt: skip
-    t_ns = frame * 100_000_000
-    return Measurements(
-        frame_id=frame, t_source_ns=t_ns, t_capture_ns=t_ns, t_utc_ns=t_ns, cc=cc, people=people,
-        ground=Ground(height_m=1.65), **fields,
-    )  # fmt: skip
+    cov = (1e-4, 0.0, 0.0, 0.0, 1e-4, 0.0, 0.0, 0.0, 1e-6)
+    return step_at(frame, SE2(ahead_m), cov=cov, people=people, ground=Ground(height_m=1.65), **fields)
 
 
 def person_at(

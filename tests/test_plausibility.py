@@ -7,16 +7,12 @@ import pytest
 
 from birdslam.geometry.se2 import SE2
 from birdslam.odometry.plausibility import PlausibilityConfig, PlausibilityGate
-from birdslam.types import INVALIDATING, EgoEdge, Measurements, Status
-
-FRAME_NS = 100_000_000
+from birdslam.types import INVALIDATING, Measurements, Status
+from tests.records import step_at
 
 
 def moved(frame: int, speed_mps: float, status: tuple[Status, ...] = ()) -> Measurements:
-    edge = EgoEdge(from_frame=frame - 1, to_frame=frame, T_from_to=SE2(0.1 * speed_mps, 0.0, 0.0), cov=(0.0,) * 9)
-    return Measurements(
-        frame_id=frame, t_source_ns=frame * FRAME_NS, t_capture_ns=0, t_utc_ns=0, cc=edge, status=status
-    )
+    return step_at(frame, SE2(0.1 * speed_mps), status=status)
 
 
 def test_hard_braking_is_plausible() -> None:
@@ -52,12 +48,7 @@ def test_long_blindness_starts_a_new_epoch() -> None:
 
 
 def at_33_hz(steps_m: list[float]) -> list[Measurements]:
-    out = []
-    for frame, step_m in enumerate(steps_m, start=1):
-        edge = EgoEdge(from_frame=frame - 1, to_frame=frame, T_from_to=SE2(step_m, 0.0, 0.0), cov=(0.0,) * 9)
-        t_ns = round(frame * 1e9 / 33.0)
-        out.append(Measurements(frame_id=frame, t_source_ns=t_ns, t_capture_ns=0, t_utc_ns=0, cc=edge))
-    return out
+    return [step_at(k, SE2(step_m), t_source_ns=round(k * 1e9 / 33.0)) for k, step_m in enumerate(steps_m, start=1)]
 
 
 def test_noise_of_single_motions_at_33_hz_is_plausible() -> None:

@@ -38,10 +38,11 @@ from birdslam.runtime.transport.bus import Bus
 from birdslam.runtime.wire import decode, encode
 from birdslam.sources.recording import RecordedFrame
 from birdslam.sources.speed_log import MAX_READINGS, added
-from birdslam.types import EgoEdge, FrameRef, Measurements, SpeedReading, SpeedSource, Status
+from birdslam.types import FrameRef, SpeedReading, SpeedSource, Status
 from tests.fake_bus import FakeBus, Inbox
 from tests.foreign_sender import foreign_session, matched
 from tests.recordings import SMALL as CAMERA
+from tests.records import step_at
 from tests.test_bus import until
 
 MS = 1_000_000
@@ -283,12 +284,9 @@ def test_estimate_reports_its_scale_source() -> None:
     graph = PoseGraph(GraphConfig(), WeightsConfig())
     said = []
     for frame in range(4):
-        stamps = {"frame_id": frame, "t_source_ns": 30 * MS * frame, "t_capture_ns": 0, "t_utc_ns": 0}
-        cov = (1e-4, 0.0, 0.0, 0.0, 1e-4, 0.0, 0.0, 0.0, 1e-6)
-        edge = EgoEdge(from_frame=frame - 1, to_frame=frame, T_from_to=SE2(0.3, 0.0, 0.0), cov=cov) if frame else None
         if frame == 3:
-            made = Measurements(**stamps, status=(Status.COASTING, Status.PERCEPTION_LATE))
+            made = step_at(frame, None, status=(Status.COASTING, Status.PERCEPTION_LATE))
         else:
-            made = Measurements(**stamps, cc=edge, speed_sources=(SpeedSource.ROAD, SpeedSource.CAR)[: frame + 1])
+            made = step_at(frame, SE2(0.3), 1e-4, speed_sources=(SpeedSource.ROAD, SpeedSource.CAR)[: frame + 1])
         said.append(graph.optimise(made).speed_sources)
     assert said == [("road",), ("road", "car"), ("road", "car"), ("carried",)]

@@ -19,8 +19,9 @@ from birdslam.graph.weights import WeightsConfig
 from birdslam.odometry.speed.standstill import StandstillDetector
 from birdslam.odometry.speed.stillness import StillnessConfig
 from birdslam.odometry.speed.zero_velocity import ZeroVelocityConfig
-from birdslam.types import EgoEdge, Measurements, Moves, VehicleEdge, VehicleEstimate
+from birdslam.types import Moves, VehicleEstimate
 from tests.recordings import KITTI
+from tests.records import new_edge, step_at
 
 BIRTH_DET = (12.0 * 2.0) ** 2
 probabilities = st.floats(0.0, 1.0)
@@ -122,18 +123,9 @@ def driven_past(
     """Estimates of a vehicle 3 m to the side with correlated errors, in 40 frames at 10 Hz."""
     graph, told = PoseGraph(config, weights), []
     for k in range(40):
-        step = EgoEdge(from_frame=k - 1, to_frame=k, T_from_to=SE2(1.0), cov=tuple((1e-4 * np.eye(3)).ravel()))
-        off_m = 0.6 * math.sin(0.4 * k)
-        seen = VehicleEdge(
-            vehicle=1,
-            frame=k,
-            T_ego_vehicle=SE2(60.0 - k + speed_mps * k / 10.0 + off_m, 3.0),
-            cov=tuple(np.diag([0.5, 0.1, 0.01]).ravel()),
-            standing=standing,
-        )
-        times = dict.fromkeys(("t_source_ns", "t_capture_ns", "t_utc_ns"), k * 100_000_000)
-        m = Measurements(frame_id=k, **times, cc=step if k else None, cv=(seen,), vv=(), cp=())
-        told += graph.optimise(m).vehicles
+        place = SE2(60.0 - k + speed_mps * k / 10.0 + 0.6 * math.sin(0.4 * k), 3.0)
+        seen = new_edge(1, k, place, (0.5, 0.1, 0.01), standing=standing)
+        told += graph.optimise(step_at(k, SE2(1.0), 1e-4, cv=(seen,))).vehicles
     return told
 
 
@@ -160,18 +152,10 @@ def test_stationary_vehicle_has_one_position_and_follows_when_it_starts() -> Non
     rng, graph, told = np.random.default_rng(1), PoseGraph(GraphConfig(), WeightsConfig()), []
     for k in range(70):
         started_s = max(0.0, (k - 45) / 10.0)
-        cov = np.diag([0.5, 0.1, 0.01])
-        off = rng.multivariate_normal(np.zeros(2), cov[:2, :2])
-        seen = VehicleEdge(
-            vehicle=1,
-            frame=k,
-            T_ego_vehicle=SE2(60.0 - 0.5 * k + 4.0 * started_s + off[0], 4.0 + off[1]),
-            cov=tuple(cov.ravel()),
-            standing=0.02 if started_s > 0.5 else 0.98,
-        )
-        step = EgoEdge(from_frame=k - 1, to_frame=k, T_from_to=SE2(0.5), cov=tuple((1e-8 * np.eye(3)).ravel()))
-        times = dict.fromkeys(("t_source_ns", "t_capture_ns", "t_utc_ns"), k * 100_000_000)
-        told += graph.optimise(Measurements(frame_id=k, **times, cc=step if k else None, cv=(seen,))).vehicles
+        off = rng.multivariate_normal(np.zeros(2), np.diag([0.5, 0.1]))
+        place = SE2(60.0 - 0.5 * k + 4.0 * started_s + off[0], 4.0 + off[1])
+        seen = new_edge(1, k, place, (0.5, 0.1, 0.01), standing=0.02 if started_s > 0.5 else 0.98)
+        told += graph.optimise(step_at(k, SE2(0.5), 1e-8, cv=(seen,))).vehicles
     still = [v for v in told[:45] if v.moves is Moves.STANDING]
     assert len(still) > 30
     at = np.array([(v.T_world_vehicle.x_m, v.T_world_vehicle.y_m) for v in still])
@@ -193,23 +177,10 @@ def test_size_error_does_not_average_out() -> None:
     for stated in (sigma, 0.0):
         graph = PoseGraph(GraphConfig(), WeightsConfig())
         for k in range(frames):
-            step = EgoEdge(from_frame=k - 1, to_frame=k, T_from_to=SE2(1.0), cov=tuple((1e-6 * np.eye(3)).ravel()))
             places = (at - [k, 0.0]) * np.exp(off)[:, None]
-            cov = tuple(np.diag([4.0, 0.04, 0.01]).ravel())
-            cv = tuple(
-                VehicleEdge(
-                    vehicle=v,
-                    frame=k,
-                    T_ego_vehicle=SE2(*place),
-                    cov=cov,
-                    depth_per_height=1.0,
-                    sigma_log_height=stated,
-                )
-                for v, place in enumerate(places.tolist())
-            )
-            times = dict.fromkeys(("t_source_ns", "t_capture_ns", "t_utc_ns"), k * 100_000_000)
-            m = Measurements(frame_id=k, **times, cc=step if k else None, cv=cv, vv=(), cp=())
-            estimate = graph.optimise(m)
+            size = {"depth_per_height": 1.0, "sigma_log_height": stated}
+            cv = tuple(new_edge(v, k, SE2(*p), (4.0, 0.04, 0.01), **size) for v, p in enumerate(places.tolist()))
+            estimate = graph.optimise(step_at(k, SE2(1.0), 1e-6, cv=cv))
         places_m = [(v.T_world_vehicle.x_m, v.T_world_vehicle.y_m) for v in estimate.vehicles]
         errors = [np.array(place) - at[v.vehicle] for place, v in zip(places_m, estimate.vehicles, strict=True)]
         covs = [np.reshape(v.cov, (3, 3))[:2, :2] for v in estimate.vehicles]
