@@ -68,15 +68,6 @@ def test_a_restored_graph_continues_bit_for_bit(
     assert goes_on(restored, log[cut:]) == goes_on(graph, log[cut:])
 
 
-def test_a_checkpoint_is_independent_of_its_graph() -> None:
-    graph = PoseGraph(*SETTINGS["measured"])
-    for m in WORLDS[0][:50]:
-        graph.optimise(m)
-    data = graph.checkpoint()
-    first = goes_on(PoseGraph.restore(data, *SETTINGS["measured"]), WORLDS[0][50:])
-    assert goes_on(PoseGraph.restore(data, *SETTINGS["measured"]), WORLDS[0][50:]) == first
-
-
 def test_a_checkpoint_after_an_edge_from_an_older_frame() -> None:
     graph, log = PoseGraph(*SETTINGS["measured"]), list(WORLDS[0][:10])
     before, last = log[-2].cc, log[-1].cc

@@ -27,10 +27,6 @@ def write(path: Path, text: str) -> Path:
     return path
 
 
-def test_an_empty_file_gives_the_defaults() -> None:
-    assert load(None) == Configuration()
-
-
 def test_differences_only(tmp_path: Path) -> None:
     path = write(tmp_path / "a.toml", 'vehicle = "van"\n[source]\nrate = 33\n[perceive]\nopencv_threads = 3\n')
     configuration = load(path)

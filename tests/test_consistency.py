@@ -21,7 +21,7 @@ from birdslam.odometry.road.kalman_filter import RoadFilter
 from birdslam.odometry.scale_config import RoadScaleConfig
 from birdslam.perf.latency.drive import Drive, DriveConfig, drive
 from birdslam.types import Estimate, Measurements, VehicleEdge
-from tests.batch_se2 import Solution, ego_key, solve, vehicle_key
+from tests.batch_se2 import ego_key, solve, vehicle_key
 from tests.recordings import KITTI as CAMERA
 from tests.records import step_at
 
@@ -107,24 +107,6 @@ def test_full_noise_costs_no_more_than_five_percent_of_the_batch(sigma_cv_rad: f
     for body in ours:
         ate_ours, ate_theirs = (np.sqrt(np.mean(np.square(errors[body]))) for errors in (ours, theirs))
         assert ate_ours <= 1.05 * ate_theirs, body
-
-
-def test_the_batch_recovers_a_world_without_noise() -> None:
-    world = drive(DriveConfig(frames=30, vehicles=2, landmarks=6, lane_points=0, noise=0.0), seed=4)
-    for weights in (ALL_EDGES, WeightsConfig(mode="paper")):
-        batch: Solution = solve(world.measurements, GraphConfig(constant_velocity=False), weights)
-        assert len(batch.frames) == 30
-        assert batch.vehicles
-        for frame in batch.frames:
-            np.testing.assert_allclose(off(batch.ego(frame), world.ego[frame]), 0.0, atol=1e-6)
-        for vehicle, frames in batch.vehicles.items():
-            for frame in frames:
-                pose = batch.vehicle(vehicle, frame)
-                np.testing.assert_allclose(off(pose, world.vehicles[vehicle][frame]), 0.0, atol=1e-6)
-
-
-def test_a_batch_of_nothing_is_nothing() -> None:
-    assert solve([], GraphConfig(), WeightsConfig()).frames == []
 
 
 # --- a vague yaw ---

@@ -277,31 +277,18 @@ def video(tmp_path: Path) -> Path:
     return path
 
 
-def test_video(video: Path) -> None:
-    recording = open_recording(f"video:{video}", camera=CAMERA)
-    frames = list(recording.frames())
-    assert (recording.name, len(recording), len(frames), recording.rate_hz) == ("drive", 20, 20, 25.0)
-    assert [frame.t_source_ns for frame in frames] == [40_000_000 * i for i in range(20)]
-    third = list(open_recording(f"video:{video}", camera=CAMERA, stride=3).frames())
-    assert [frame.t_source_ns for frame in third] == [120_000_000 * i for i in range(7)]
-    assert [frame.index for frame in third] == list(range(7))
-    assert third[2].image.mean() == pytest.approx(60.0, abs=3.0)
-
-
-def test_a_video_without_camera_or_of_another_size_is_refused(video: Path, tmp_path: Path) -> None:
+def test_a_video_without_camera_or_of_another_size_is_refused(video: Path) -> None:
     with pytest.raises(DatasetError, match="give a camera file"):
         open_recording(f"video:{video}")
     with pytest.raises(DatasetError, match="is 64x32, but the given camera is 640x480"):
         open_recording(f"video:{video}", camera=Camera(640, 480, 500.0, 500.0, 320.0, 240.0, 1.5))
-    with pytest.raises(DatasetError, match="no such file"):
-        open_recording(f"video:{tmp_path / 'none.avi'}", camera=CAMERA)
-    (tmp_path / "text.avi").write_text("no video\n" * 100)
-    with pytest.raises(DatasetError, match=r"text\.avi: is not a video"):
-        open_recording(f"video:{tmp_path / 'text.avi'}", camera=CAMERA)
 
 
 def test_truncated_video_ends_with_its_reason(video: Path) -> None:
     data = video.read_bytes()
+    assert [f.t_source_ns for f in open_recording(f"video:{video}", camera=CAMERA).frames()] == [
+        40_000_000 * i for i in range(20)
+    ]
     video.write_bytes(data[: len(data) * 6 // 10])
     frames = list(open_recording(f"video:{video}", camera=CAMERA).frames())
     assert frames[-1].image is None

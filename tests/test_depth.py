@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from birdslam.geometry.camera import Camera
 from birdslam.perception import ModelError, ModelSpec, load_network
 from birdslam.perception.decoding.depth import DepthMap
-from birdslam.perception.manifest import Disparity, MetricDepth
 from tests import tiny_networks as tiny
 
 INPUT = tiny.SEGMENTER.partition("[segmenter]")[0].replace("segmenter", "depth")
@@ -127,8 +126,3 @@ def test_pseudo_lidar_projects_to_its_pixels(width: int, height: int, depth_m: f
     px = points[:, :2] / points[:, 2:] * [CAMERA.fx_px, CAMERA.fy_px] + [CAMERA.cx_px, CAMERA.cy_px]
     np.testing.assert_allclose(depth.at(px), depth_m, rtol=1e-6)
     np.testing.assert_allclose(px[0] + 0.5, [32 / width, 16 / height], atol=1e-6)
-
-
-def test_the_tables_defaults_are_monodepth2s() -> None:
-    assert (Disparity(output="d").min_depth_m, Disparity(output="d").max_depth_m) == (0.1, 100.0)
-    assert MetricDepth(output="d").canonical_focal_rel == 0.0

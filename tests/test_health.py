@@ -44,7 +44,6 @@ from birdslam.runtime.process.restarts import Assignment
 from birdslam.runtime.slices import SHORT_NS, own_threads, wake_soon
 from birdslam.runtime.supervision.live import LiveLine
 from birdslam.runtime.supervision.logbook import Logbook
-from birdslam.runtime.topology import NODES
 from birdslam.runtime.transport.bus import Bus
 from birdslam.runtime.wire import Health, Spread, Stage, Trace, decode, encode
 from birdslam.types import Estimate, MapUpdate, Status
@@ -80,12 +79,6 @@ def test_budgets_load_if_they_add_up(parts: list[float], whole: float) -> None:
     else:
         with pytest.raises(ConfigurationError, match="end_to_end_ms"):
             load(None, tree)
-
-
-def test_every_node_has_a_budget_and_a_scheduling() -> None:
-    for node in NODES:
-        assert BudgetsConfig().step_ms(node) > 0.0
-        assert RealtimeConfig().of(node).priority > 0
 
 
 def test_recent_values_expire() -> None:
