@@ -1,7 +1,8 @@
-"""The command line: a user error is one line on standard error and exit status 2."""
+"""The command line: errors of one line with exit status 2, progress, and completion."""
 
 from __future__ import annotations
 
+import io
 import os
 import subprocess
 import sys
@@ -11,11 +12,16 @@ import cv2
 import numpy as np
 import pytest
 
+from birdslam.lanes.amodal.lanes import BOUNDARY, ROAD, LanesConfig
 from birdslam.perception import ModelSpec
+from birdslam.perception.completion import SHIPPED, GridCompletion
+from birdslam.perception.manifest import ModelError
 from birdslam.runtime.cli.commands import COMMANDS, Command, parse
 from birdslam.runtime.cli.main import main
 from birdslam.runtime.configuration import ConfigurationError
 from birdslam.runtime.options import configuration_of
+from birdslam.runtime.progress import Progress, time_to_go, with_progress
+from tests.tiny_networks import echo
 
 NOWHERE = "kitti:/nowhere/at/all"
 
@@ -234,3 +240,100 @@ def test_the_shell_completes(line: str, offered: str, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "birdslam.runtime.cli.main"]
     subprocess.run(command, env={**os.environ, **asked}, check=False, timeout=60)
     assert answer.read_text().split() == offered.split()
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now_s = 100.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0.2, "0:00"), (7.4, "0:07"), (750.0, "12:30"), (3750.0, "1:02:30"), (-3.0, "0:00")]
+)
+def test_times_to_go(seconds: float, text: str) -> None:
+    assert time_to_go(seconds) == text
+
+
+def test_remaining_time_ignores_the_first_item() -> None:
+    clock, stream = Clock(), Terminal()
+    with Progress("drive", 11, stream=stream, clock=clock) as progress:
+        clock.now_s += 60.0  # loading
+        progress.advance()
+        assert progress.line(clock.now_s) == "drive: 1 of 11 frames"
+        clock.now_s += 4.0
+        progress.advance(2)
+        assert progress.line(clock.now_s) == "drive: 3 of 11 frames, 0:16 to go"
+    assert stream.getvalue().endswith("\r\x1b[K")
+    assert "\n" not in stream.getvalue()
+
+
+def test_a_second_pass_and_an_unknown_end() -> None:
+    clock = Clock()
+    progress = Progress("replay", None, "MB", 1e6, stream=Terminal(), clock=clock)
+    progress.reach(1_500_000)
+    clock.now_s += 1.0
+    progress.reach(2_500_000)
+    assert progress.line(clock.now_s) == "replay: 2.5 MB"
+    progress.total = 4_500_000
+    assert progress.line(clock.now_s) == "replay: 2.5 of 4.5 MB, 0:02 to go"
+    progress.reach(500_000)
+    assert progress.line(clock.now_s) == "replay: 0.5 of 4.5 MB"
+
+
+def test_without_terminal_there_is_one_line_per_minute() -> None:
+    clock, stream = Clock(), io.StringIO()
+    with Progress("drive", 1000, stream=stream, clock=clock) as progress:
+        for _ in range(150):
+            clock.now_s += 1.0
+            progress.advance()
+    assert stream.getvalue() == "drive: 60 of 1000 frames, 15:40 to go\ndrive: 120 of 1000 frames, 14:40 to go\n"
+
+
+def test_items_pass_through(capsys: pytest.CaptureFixture[str]) -> None:
+    assert list(with_progress(iter("abc"), "letters", 3)) == ["a", "b", "c"]
+    assert capsys.readouterr().err == ""
+
+
+SHAPE = LanesConfig().shape
+
+
+def test_a_network_of_the_right_shape_is_taken(tmp_path: Path) -> None:
+    complete = GridCompletion((16, 8), echo(tmp_path / "echo.onnx", (1, 2, 16, 8)))
+    grids = np.random.default_rng(0).random((2, 16, 8), dtype=np.float32)
+    np.testing.assert_array_equal(complete(grids), grids)
+
+
+def test_unsuitable_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match=r"none\.onnx: the network can't be read"):
+        GridCompletion(SHAPE, tmp_path / "none.onnx")
+    (tmp_path / "text.onnx").write_text("no network")
+    with pytest.raises(ModelError, match=r"text\.onnx: onnxruntime"):
+        GridCompletion(SHAPE, tmp_path / "text.onnx")
+    with pytest.raises(ModelError, match=r"inputs have shapes \[\[1, 2, 16, 8\]\], grids need \[1, 2, 128, 128\]"):
+        GridCompletion(SHAPE, echo(tmp_path / "small.onnx", (1, 2, 16, 8)))
+
+
+@pytest.mark.skipif(not SHIPPED.is_file(), reason="built without the lane network")
+def test_shipped_network_joins_a_hidden_line() -> None:
+    grids = np.zeros((2, *SHAPE), dtype=np.float32)
+    grids[ROAD, :92, 44:84] = 1.0  # 10 m wide, seen up to 15 m ahead
+    grids[BOUNDARY, :92, 63:65] = 1.0
+    hidden = slice(40, 52)  # 3 m of it
+    grids[:, hidden, 50:84] = 0.0
+    complete = GridCompletion(SHAPE)
+    out = complete(grids)
+    assert out.shape == grids.shape
+    assert out.min() >= 0.0
+    assert out.max() <= 1.0
+    assert np.mean(out[ROAD, hidden, 50:80] > 0.5) > 0.8
+    assert np.mean(out[BOUNDARY, hidden, 62:66].max(axis=1) > 0.5) > 0.8
+    assert np.mean(out[BOUNDARY, hidden, 70:80] > 0.5) < 0.05
+    np.testing.assert_array_equal(complete(grids), out)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import html
 import importlib
 import inspect
 import io
 import re
+import shutil
 import subprocess
 from collections.abc import Iterator, Mapping
 from contextlib import redirect_stdout
@@ -17,6 +19,7 @@ import msgspec
 import pytest
 import yaml
 
+from birdslam.bench.simulation.odometry import OdometryNoise
 from birdslam.perf.__main__ import benchmark_modules
 from birdslam.runtime.cli.main import main
 from birdslam.runtime.configuration import Configuration, ConfigurationError, load
@@ -24,6 +27,8 @@ from birdslam.runtime.fields import fields, stands_for
 from birdslam.runtime.keys import GROUPS, KEYS
 from birdslam.runtime.pages import configuration as configuration_page
 from birdslam.runtime.pages.tables import comments
+from birdslam.slam import SlamConfig
+from tests.chromium import chromium, look
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
@@ -277,3 +282,72 @@ class Derived(Base):
 def test_comments_of_fields() -> None:
     assert comments(Base) == {"first": "of the base", "second": "Told above, in two lines"}
     assert comments(Derived) == {"first": "again", "second": "Told above, in two lines", "third": "over several lines"}
+
+
+SCRIPT = Path(__file__).resolve().parent.parent / "docs" / "site" / "iframe-worker.js"
+PAGE = """<!doctype html><html><head><meta charset="utf-8"><script src="iframe-worker.js"></script></head><body><script>
+const worker = new Worker("worker.js");
+worker.addEventListener("message", ({data}) => document.documentElement.dataset.heard = JSON.stringify(data));
+worker.postMessage({type: 0, words: ["one", "two"]});
+</script></body></html>"""
+WORKER = """addEventListener("message", async ({data}) => {
+  postMessage({words: data.words.length, inFrame: self !== parent});
+});"""
+
+
+@pytest.mark.slow
+@pytest.mark.processes
+@pytest.mark.skipif(chromium() is None, reason="no Chromium")
+def test_a_page_from_disk_has_a_worker_that_answers(tmp_path: Path) -> None:
+    shutil.copy(SCRIPT, tmp_path)
+    (tmp_path / "page.html").write_text(PAGE)
+    (tmp_path / "worker.js").write_text(WORKER)
+    seen = look((tmp_path / "page.html").as_uri(), tmp_path / "page.png")
+    assert seen.console == []
+    assert html.unescape(seen.said["heard"]) == '{"words":2,"inFrame":true}'
+
+
+CONSTANTS_PAGE = Path(__file__).parent.parent / "docs" / "constants.md"
+ROWS = re.findall(r"^\| `([\w.]+)` \| ([^|]+) \| ([^|]+) \| ([^|]+) \|$", CONSTANTS_PAGE.read_text(), re.MULTILINE)
+RECORDINGS = re.compile(r"KITTI|\b00[01]\d\b|raw clip|motorway clip|shipped drive")
+
+
+def in_code(name: str) -> object:
+    """A field of the default configuration, or a constant of a module."""
+    value: object
+    if name.startswith("slam."):
+        value, parts = SlamConfig(), name.split(".")[1:]
+    else:
+        words = name.split(".")
+        at = next(k for k in range(len(words)) if not words[k].islower())
+        value, parts = importlib.import_module(".".join(words[:at])), words[at:]
+    for part in parts:
+        value = value[part] if isinstance(value, dict) else getattr(value, part)
+        value = value() if isinstance(value, type) else value
+    return value
+
+
+@pytest.mark.parametrize(("name", "stated"), [(name, stated.strip()) for name, stated, *_ in ROWS])
+def test_a_constant_is_what_the_page_says(name: str, stated: str) -> None:
+    value = in_code(name)
+    if stated == "fitted":
+        assert value == OdometryNoise()
+    elif isinstance(value, msgspec.Struct):
+        assert [float(number) for number in stated.split(",")] == list(msgspec.structs.astuple(value)[:3])
+    else:
+        assert value == float(stated)
+
+
+def test_every_key_that_names_a_recording_is_on_the_page() -> None:
+    names = {name for name, *_ in ROWS}
+    assert len(names) == len(ROWS) > 20
+    found = list(fields(SlamConfig, SlamConfig(), "slam."))
+    assert {f.key for f in found if RECORDINGS.search(comments(f.struct).get(f.name, ""))} <= names
+
+
+def test_page_matches_rows_of_the_papers_tables() -> None:
+    """What the eleven sequences chose, 0010 and 0018 chose: the row of Tables 1-5 names each."""
+    (tables,) = re.findall(r"^\| Tables 1-5 \| .*$", CONSTANTS_PAGE.read_text(), re.MULTILINE)
+    chosen = [name.split(".")[-1] for name, _, data, _ in ROWS if "the eleven sequences" in data]
+    assert len(chosen) == 7
+    assert [name for name in chosen if f"`{name}`" not in tables] == []

@@ -48,7 +48,7 @@ from birdslam.sources.recording import DatasetError
 from birdslam.types import Measurements
 from tests import tiny_networks as tiny
 from tests import tracking_world
-from tests.test_label_projection import with_right_camera
+from tests.test_kitti_labels import with_right_camera
 
 FRAMES = range(40)
 
