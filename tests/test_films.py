@@ -49,7 +49,7 @@ def film(
     """One frame at each time; its upper left quarter is bright, the rest is darker from frame to frame."""
     with av.open(str(path), "w", options={"movflags": "use_metadata_tags"} if metadata else {}) as container:
         container.metadata.update(metadata or {})
-        options = {"x265-params": "log-level=none"} if codec == "libx265" else {}
+        options = {"x265-params": "log-level=none"} if codec == "libx265" else {"threads": "1"}
         stream = container.add_stream(codec, rate=30, options=options)
         stream.width, stream.height = size
         stream.pix_fmt = "yuv420p" if size[0] % 2 == 0 else "yuv444p"
@@ -367,7 +367,7 @@ def moving_film(path: Path, numbers: Sequence[int], quality: str = "20") -> Path
     texture = cv2.GaussianBlur(np.random.default_rng(3).integers(0, 256, (480, 2400), dtype=np.uint8), (0, 0), 4.0)
     texture = np.asarray(cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX), np.uint8)
     with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=30, options={"crf": quality})
+        stream = container.add_stream("libx264", rate=30, options={"crf": quality, "preset": "veryfast", "threads": "1"})
         stream.width, stream.height, stream.pix_fmt = 320, 240, "yuv420p"
         for k in numbers:
             grey = texture[100:340, 3 * k : 3 * k + 320]
