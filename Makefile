@@ -55,7 +55,7 @@ exiftool:
 			&& apt-get update -q && apt-get install -qy --no-install-recommends libimage-exiftool-perl; } \
 		|| echo "no ExifTool: tests of GNSS tracks skip (Debian, as root: apt-get install libimage-exiftool-perl)"
 
-# Runs computing tests first, one per core, then tests that start processes, three at a time
+# Runs computing tests first, one per core, then tests that start processes, four at a time
 test: browser exiftool setup
 	@$(BIN)/python -m tests.run
 

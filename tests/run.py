@@ -130,7 +130,7 @@ def main() -> int:
         return under_variants(names, ON_EACH_CPU)
     print(f"kernels: {kernels()}", flush=True)
     computing = pytest(COMPUTING, os.cpu_count() or 2, {})
-    processes = pytest(f"processes and {ON_EACH_CHANGE}", 3, {})
+    processes = pytest(f"processes and {ON_EACH_CHANGE}", 4, {})
     total = computing + processes
     print(f"make test: {total} (computing {computing.seconds:.0f} s, processes {processes.seconds:.0f} s)")
     return int(total.status != 0)
