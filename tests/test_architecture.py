@@ -166,8 +166,6 @@ def test_no_machine_path_or_secret_host_in_the_tree() -> None:
                 assert "/root/" not in text, path
 
 
-# --- tests go through public doors ---
-
 NAMEDTUPLES = {"_replace", "_asdict", "_fields", "_make"}  # public, though they look otherwise
 
 

@@ -418,7 +418,6 @@ def test_cars_and_lanes_estimate_the_height_and_disagreement_widens_sigma() -> N
 
 @pytest.mark.parametrize("height_m", [0.9, 1.35, 2.2])
 def test_the_height_by_painted_lanes(height_m: float) -> None:
-    """Seen at 1.5 m, lanes of 3.5 m look narrower or wider in proportion."""
     rng = np.random.default_rng(3)
     seen = [LaneWidth(1.5 / height_m * rng.normal(3.5, 0.1), 0.4) for _ in range(200)]
     (check,) = checks_by_lanes(seen, 1.5, 0.004)
@@ -458,7 +457,6 @@ def test_a_known_lane_width_sets_the_height(width_m: float) -> None:
 
 @pytest.mark.parametrize("height_m", [1.2, 1.45, 2.9])
 def test_a_vehicle_of_known_size_sets_the_height(height_m: float) -> None:
-    """The height is proportional to the vehicle's; vehicles with fewer boxes have no effect."""
     rng = np.random.default_rng(5)
     camera = Camera(1280, 720, 1100.0, 1100.0, 639.5, 359.5, 1.5)
     boxes = [

@@ -155,7 +155,6 @@ def test_a_fisheye_of_every_format_is_equidistant(tmp_path: Path, kind: str, bef
 
 @pytest.mark.parametrize("count", [4, 5, 8, 12, 14])
 def test_opencvs_models_of_distortion_reach_the_camera(tmp_path: Path, count: int) -> None:
-    """Undistorted points are those of OpenCV for as many coefficients."""
     from birdslam.geometry.camera import Camera
 
     D = [-0.3, 0.1, 0.001, 0.0005, 0.01, 0.02, 0.005, 0.001, 1e-4, 0.0, 1e-4, 0.0, 1e-3, 1e-3][:count]

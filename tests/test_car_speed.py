@@ -47,9 +47,6 @@ def way(speed: SpeedReadings, from_s: float, to_s: float, delay_s: float = 0.0) 
     return found.distance_m, found.var_m2
 
 
-# --- readings ---
-
-
 @given(st.data())
 def test_bad_double_and_shuffled_readings_change_nothing(data: st.DataObject) -> None:
     steps = data.draw(st.lists(st.floats(-0.3, 0.3), min_size=5, max_size=30))
@@ -114,9 +111,6 @@ def test_a_jump_is_refused_until_it_lasts() -> None:
     lasting = heard([*before, *jumped, *(reading(t, 25.0) for t in np.arange(1.4, 1.6, 0.02))], 1.6)
     assert lasting.status == []
     assert way(lasting, 1.4, 1.5)[0] == pytest.approx(2.5)
-
-
-# --- scale factor and delay ---
 
 
 class World:
@@ -276,9 +270,6 @@ def test_three_contradictions_by_the_road_reject_readings() -> None:
     assert not world.car.is_trusted
     assert Status.CAR_SPEED_IMPLAUSIBLE in world.car.status()
     assert world.car.motion(4 * NS_PER_S, 5 * NS_PER_S) is None
-
-
-# --- the odometry ---
 
 
 def driven(

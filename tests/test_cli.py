@@ -54,7 +54,6 @@ def test_every_command_of_the_table_exists(command: Command, capsys: pytest.Capt
 
 @pytest.mark.processes
 def test_help_imports_no_heavy_library(tmp_path: Path) -> None:
-    """It does not import the libraries for computation."""
     code = "import sys; from birdslam.runtime.cli.commands import parse\ntry: parse(['--help'])\n"
     code += "except SystemExit: assert not {'numpy', 'cv2', 'zenoh', 'msgspec'} & set(sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=False).returncode == 0

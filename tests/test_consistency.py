@@ -46,9 +46,6 @@ def run(measurements: Iterable[Measurements], config: GraphConfig, weights: Weig
     return [graph.optimise(m) for m in measurements]
 
 
-# --- gtsam ---
-
-
 def assert_gtsam_agrees(world: Drive, config: GraphConfig, weights: WeightsConfig, tolerance: float) -> None:
     """Poses and covariances of a few frames are those of the batch over all edges so far."""
     estimates = run(world.measurements, config, weights)
@@ -109,9 +106,6 @@ def test_full_noise_costs_no_more_than_five_percent_of_the_batch(sigma_cv_rad: f
         assert ate_ours <= 1.05 * ate_theirs, body
 
 
-# --- a vague yaw ---
-
-
 @pytest.mark.parametrize("turn_rad", [-1.2, -0.4, 0.6, 1.3])
 def test_a_yaw_that_turns_out_to_be_another_one_leaves_the_place_where_it_is(turn_rad: float) -> None:
     """Seen far away, a car's place is known well across the line of sight and badly along it, whatever its yaw."""
@@ -131,9 +125,6 @@ def test_a_yaw_that_turns_out_to_be_another_one_leaves_the_place_where_it_is(tur
         away = np.hypot(estimate.T_world_vehicle.x_m - place.x_m, estimate.T_world_vehicle.y_m - place.y_m)
         assert away < 0.02
     assert abs(estimate.T_world_vehicle.yaw_rad - place.yaw_rad - turn_rad) < 0.5 * abs(turn_rad)
-
-
-# --- uncertainty ---
 
 
 def weigh(error: Floats, cov: Iterable[float]) -> float:

@@ -64,7 +64,6 @@ def test_a_stride_keeps_times_and_truth_together() -> None:
 
 
 def test_bodies_project_into_their_boxes(demo: DemoRecording) -> None:
-    """A footprint on the road projects into the lower part of its box; hidden bodies are included."""
     checked, hidden = 0, 0
     for index in range(0, 1000, 50):
         plane = demo.truth_ground(index)

@@ -194,7 +194,6 @@ socket.socketpair(socket.AF_UNIX)
 
 
 def test_the_sandbox_from_inside(machine: Machine) -> None:
-    """A program under the unit's own rules tries what it must not, and what it needs."""
     machine("systemd-sysusers", "/srv/birdslam/deploy/birdslam.sysusers")
     unit = re.sub(r"ExecStart=.*?(?<!\\\\)\n", "ExecStart=/usr/bin/python3 /srv/probe.py\n", UNIT_TEXT, flags=re.DOTALL)
     unit = unit.replace("Type=notify", "Type=oneshot").replace("Restart=on-failure", "Restart=no")

@@ -109,8 +109,6 @@ def test_too_few_fixes_are_an_error(take: slice, why: str) -> None:
         align_with_fixes(t_ns[:], [SE2()] * 400 if why == "are needed" else poses, fixes_of(t_ns, enu, 1.0)[take])
 
 
-# --- files in ---
-
 CSV = b"time_s,latitude_deg,longitude_deg,speed_mps\n0.5,51.04933,-114.05395,12.778\n1.5,51.04928,-114.05411,\n"
 RMC = "GPRMC,123519.50,A,4807.038,N,01131.000,E,022.4,084.4,230394,003.1,W"
 GPX = (
@@ -224,9 +222,6 @@ def test_table_columns_are_identified_by_meaning(encoding: str) -> None:
     assert [fix.t_source_ns for fix in track.fixes] == [3, 1_000_000_003]  # Unix time; the film starts at 0
     assert track.fixes[0].speed_mps == pytest.approx(10.0)
     assert not track.clock_is_known
-
-
-# --- files out ---
 
 
 def test_the_files_are_valid_and_contain_the_line(tmp_path: Path) -> None:

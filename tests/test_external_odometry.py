@@ -72,7 +72,6 @@ def test_motions_are_those_of_the_file(ego: bool, times: bool) -> None:
 
 @given(st.lists(st.floats(0.0, 0.9), min_size=2, max_size=8, unique=True))
 def test_poses_are_interpolated(times_s: list[float]) -> None:
-    """At any times the motions add up to the file's motion between them."""
     times_ns = sorted(round(t * NS_PER_S) for t in times_s)
     if len(set(times_ns)) < len(times_ns):
         return
@@ -87,7 +86,6 @@ def test_poses_are_interpolated(times_s: list[float]) -> None:
 
 
 def test_missing_poses_are_not_invented() -> None:
-    """A gap is coasted with a growing covariance; the next motion starts at the last given pose."""
     told = trajectory(40)
     kept = (np.arange(40) < 10) | (np.arange(40) >= 16)
     odometry = ExternalOdometry(CAMERA, TimedPoses(told.poses[kept], told.t_ns[kept]), ExternalConfig())
@@ -112,7 +110,6 @@ def driven(odometry: ExternalOdometry, times_ns: list[int]) -> list[Estimate]:
 
 
 def test_a_drive_follows_the_file_and_is_invalid_where_it_ended() -> None:
-    """A file that ends early: first coasting, then no valid pose at all."""
     times_ns = [k * NS_PER_S // 10 for k in range(60)]
     found = driven(ExternalOdometry(CAMERA, trajectory(30), ExternalConfig()), times_ns)
     start = egos(30)
@@ -129,9 +126,6 @@ def test_times_of_another_clock_give_a_status() -> None:
     late = [k * NS_PER_S // 10 + 1000 * NS_PER_S for k in range(5)]
     found = driven(ExternalOdometry(CAMERA, trajectory(30), ExternalConfig()), late)
     assert all(not e.valid and Status.NOT_INITIALISED in e.status for e in found)
-
-
-# --- the file ---
 
 
 def tum(path: Path, told: TimedPoses) -> Path:

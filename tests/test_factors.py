@@ -128,9 +128,6 @@ def assert_is(after: Estimate, expected: tuple[SE2, Floats]) -> None:
     np.testing.assert_allclose(np.reshape(after.cov, (3, 3)), expected[1], rtol=1e-4, atol=1e-10)
 
 
-# --- a place by GNSS ---
-
-
 def fix_at(estimate: Estimate, away_m: tuple[float, float], sigma_m: float) -> Fix:
     T = estimate.T_world_ego
     return Fix(T.x_m + away_m[0], T.y_m + away_m[1], sigma_m)
@@ -205,9 +202,6 @@ def test_non_finite_edge_is_left_out() -> None:
     assert run(graph_with(Gnss(), LaneLine()), {m.frame_id: nowhere for m in LOG}) == run(graph_with(), {})
 
 
-# --- a lane line: a general Jacobian ---
-
-
 def test_line_constrains_lateral_position_and_heading() -> None:
     before = run(graph_with(), {})[-1]
     T = before.T_world_ego
@@ -216,9 +210,6 @@ def test_line_constrains_lateral_position_and_heading() -> None:
     after = run(graph_with(LaneLine()), {LOG[-1].frame_id: (line,)})[-1]
     J = np.array([[np.sin(T.yaw_rad), np.cos(T.yaw_rad), 0.0], [0.0, 0.0, 1.0]])
     assert_is(after, updated(before, J, np.array([0.2, -0.02]), np.diag(np.square(line.sigmas))))
-
-
-# --- vehicles apart, and together ---
 
 
 class Gap(Factor):
@@ -253,8 +244,6 @@ def test_vehicles_connected_by_an_edge_share_a_covariance() -> None:
 
 
 def test_line_of_a_vehicle_is_the_same_edge_jointly_and_separately() -> None:
-    """Edges to single vehicles, with general Jacobians."""
-
     class Aside(Factor):
         name = "aside"
         equation = "y + yaw"
@@ -277,9 +266,6 @@ def test_line_of_a_vehicle_is_the_same_edge_jointly_and_separately() -> None:
         assert a.cov == pytest.approx(b.cov, rel=1e-6, abs=1e-9)
         assert a.velocity_mps == pytest.approx(b.velocity_mps, rel=1e-6, abs=1e-7)
         assert a.T_world_vehicle.between(b.T_world_vehicle).log() == pytest.approx(np.zeros(3), abs=1e-7)
-
-
-# --- the list is data ---
 
 
 def test_a_graph_of_odometry_alone_is_dead_reckoning() -> None:

@@ -342,7 +342,6 @@ def test_letters_in_file_names_do_not_split_cameras(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["film.mp4", "film.mkv", "film.avi"])
 @pytest.mark.parametrize("aspect", [Fraction(4, 3), Fraction(8, 9), Fraction(1, 1)])
 def test_pixels_of_anamorphic_films_are_made_square(tmp_path: Path, name: str, aspect: Fraction) -> None:
-    """A circle of the scene is a circle of the image."""
     width, height, path = 144, 108, tmp_path / name
     circle = cv2.circle(np.zeros((height, round(width * aspect), 3), np.uint8), (60, 54), 40, (255,) * 3, -1)
     coded = cv2.resize(circle, (width, height), interpolation=cv2.INTER_AREA)
@@ -367,7 +366,9 @@ def moving_film(path: Path, numbers: Sequence[int], quality: str = "20") -> Path
     texture = cv2.GaussianBlur(np.random.default_rng(3).integers(0, 256, (480, 2400), dtype=np.uint8), (0, 0), 4.0)
     texture = np.asarray(cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX), np.uint8)
     with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=30, options={"crf": quality, "preset": "veryfast", "threads": "1"})
+        stream = container.add_stream(
+            "libx264", rate=30, options={"crf": quality, "preset": "veryfast", "threads": "1"}
+        )
         stream.width, stream.height, stream.pix_fmt = 320, 240, "yuv420p"
         for k in numbers:
             grey = texture[100:340, 3 * k : 3 * k + 320]

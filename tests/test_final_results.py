@@ -218,9 +218,6 @@ def call(*arguments: str) -> int:
     return subprocess.run([sys.executable, "-m", "birdslam.runtime.cli.main", *arguments], timeout=170).returncode
 
 
-# --- the video ---
-
-
 def pictures(path: Path) -> list[np.ndarray]:
     video, out = cv2.VideoCapture(str(path)), []
     while (read := video.read())[0]:

@@ -55,7 +55,6 @@ needs_openssl = pytest.mark.skipif(shutil.which("openssl") is None, reason="open
 
 @given(st.text(_LETTERS, max_size=40), st.sampled_from(sorted({*TOPICS, *QUERIES})))
 def test_vehicle_name_matches_only_its_own_keys(name: str, topic: str) -> None:
-    """Whatever somebody calls a vehicle: it is refused, or the key is one plain key that names it alone."""
     try:
         key = key_of(name, topic)
     except ValueError:
@@ -294,7 +293,6 @@ def raw_config(tls: Path, port: int, name: str, authority: str = "ca.pem", limit
 @processes
 @needs_openssl
 def test_each_certificate_has_only_its_permissions(tls: Path, port: int) -> None:
-    """A vehicle, a listener and a stranger write every key, declare liveliness, and answer queries."""
     with ExitStack() as stack:
         stack.enter_context(zenoh.open(router_config(router_table(tls, port))))
         fleet = stack.enter_context(Fleet(link(tls, port, "operator")))
@@ -359,7 +357,6 @@ def test_connection_needs_a_certificate_of_the_authority(tls: Path, port: int) -
 def test_flood_and_crash_do_not_affect_other_vehicles(
     tmp_path_factory: pytest.TempPathFactory, tls: Path, port: int
 ) -> None:
-    """Red floods, then dies: green and blue arrive without gaps, and each vehicle's state is reported."""
     base = tmp_path_factory.mktemp("f")
     with zenoh.open(router_config(router_table(tls, port))):
         red, green, blue = vehicles = [Vehicle(name, base, tls, port) for name in NAMES]
@@ -400,7 +397,6 @@ def test_flood_and_crash_do_not_affect_other_vehicles(
 @processes
 @needs_openssl
 def test_restarted_router_is_found(tmp_path_factory: pytest.TempPathFactory, tls: Path, port: int) -> None:
-    """By a vehicle and by a listener; meanwhile the vehicle is reported as not alive."""
     table = router_table(tls, port)
     router = zenoh.open(router_config(table))
     red = Vehicle("red", tmp_path_factory.mktemp("f"), tls, port)
@@ -420,7 +416,6 @@ def test_restarted_router_is_found(tmp_path_factory: pytest.TempPathFactory, tls
 @processes
 @needs_openssl
 def test_commands_reconnect(tmp_path_factory: pytest.TempPathFactory, tls: Path, port: int) -> None:
-    """`birdslam uplink` starts before its router, the router restarts, the uplink is killed."""
     base = tmp_path_factory.mktemp("f")
     (base / "router.toml").write_text(
         f'[router]\nlisten = "tls/127.0.0.1:{port}"\nca = "{tls}/ca.pem"\ncertificate = "{tls}/router.pem"\n'

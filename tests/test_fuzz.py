@@ -30,7 +30,6 @@ def test_every_target_holds() -> None:
 
 @pytest.mark.parametrize("name", [name for name, *_ in fuzz.readers()])
 def test_every_number_of_a_file_may_be_any_other(name: str, tmp_path: Path) -> None:
-    """Each number of each valid file, replaced by each of a few: a whole record, or the reader's own exception."""
     goods, read, refusal = next(rest for found, _, *rest in fuzz.readers() if found == name)
     path = tmp_path / "file.toml"
     for good in goods:

@@ -188,7 +188,6 @@ def test_wrong_calibrations_are_named(changes: dict[str, object], names: str) ->
 
 
 def test_undistortion_straightens_a_line() -> None:
-    """A vertical line of the world, seen through a lens with barrel distortion, is straight again afterwards."""
     lens = camera(distortion=(-0.3, 0.1, 0.0, 0.0))
     image = np.zeros((375, 1242), np.uint8)
     y = (np.arange(-0.2, 0.25, 0.0005))[:, None]

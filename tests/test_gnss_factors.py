@@ -105,7 +105,6 @@ def test_fixes_with_15_m_error_for_10_s_are_rejected() -> None:
 @pytest.mark.parametrize("length_m", [80.0, 200.0])
 @pytest.mark.parametrize("off_m", [100.0, 1e3, 1e5])
 def test_a_short_drive_with_a_far_outlier_keeps_its_place(length_m: float, off_m: float) -> None:
-    """A far outlier is counted, and moves neither the fit of all fixes nor their delay."""
     true, nodes, links = way(length_m, seed=1)
     fixes = fixes_of(true, 5.0)
     right = tied(true, nodes, links, fixes)
@@ -209,7 +208,6 @@ def test_memory_of_map_points_is_linear_in_length(tmp_path: Path) -> None:
 
 
 def test_points_of_a_long_drive_are_transformed_in_chunks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """However many there are, they take the same memory."""
     monkeypatch.setattr(placed, "MAX_FEATURE_POINTS", 250)
     write_places(tmp_path, [Place(0, 0, SE2(), SE2(5.0, 0.0, 0.0))])
 
@@ -258,9 +256,6 @@ def test_road_and_tracks_are_beside_the_trajectory_on_earth(tmp_path: Path) -> N
     in_map = json.loads((tmp_path / "road.map.geojson").read_text())["features"][0]["geometry"]["coordinates"]
     left_m = [place.T_map_ego.inverse() @ np.array([p]) for place, p in zip(places, in_map, strict=True)]
     assert np.array(left_m).reshape(-1, 2) == pytest.approx(np.array([[0.0, 2.0]] * len(places)), abs=0.01)
-
-
-# --- where fixes come from ---
 
 
 def sentence(body: str) -> bytes:

@@ -105,7 +105,6 @@ def test_vehicles_on_another_street_give_no_false_roll() -> None:
 
 
 def test_tilt_and_sizes_are_consistent() -> None:
-    """Over seeds, errors of the pitch against its sigma."""
     ratios = []
     for seed in range(12):
         rng = np.random.default_rng(seed)

@@ -162,9 +162,6 @@ def test_motion_that_leaves_the_image_explains_nothing() -> None:
     assert _explained(grey, grey, np.array([60.0])).max() == 0.0
 
 
-# --- on recorded drives ---
-
-
 START_IMAGES = 13
 
 

@@ -490,7 +490,6 @@ def test_bare_road_has_no_lines() -> None:
 
 
 def test_noise_and_jumps_do_not_raise() -> None:
-    """Whatever images and motions come, the lines are finite, or there are none."""
     rng = np.random.default_rng(7)
     tracker, pose = LineTracker(CAMERA), SE2()
     for k in range(22):
@@ -579,7 +578,6 @@ def test_lane_probabilities_sum_to_one(x_m: float, y_m: float, sigma_m: float, y
 
 @given(st.lists(st.floats(-400.0, 400.0), max_size=3))
 def test_distant_users_are_in_no_lane(xs_m: list[float]) -> None:
-    """Also if no user is nearer."""
     lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0)
     users = [UserInEgo(k, SE2(x_m, 0.1, 0.0), np.eye(3) * 0.1, 4.0, 8.0) for k, x_m in enumerate(xs_m)]
     placed = with_users(lanes, users, 10.0, Traffic()).vehicles

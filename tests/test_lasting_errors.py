@@ -91,7 +91,6 @@ def test_lower_edge_is_not_learned_from_itself() -> None:
 
 @pytest.mark.parametrize("leap_m", [(4.5,), (3.0,), (2.2, 4.5)])
 def test_parked_car_with_a_neighbours_box_stays_stationary(leap_m: tuple[float, ...]) -> None:
-    """With a jump of a car's length, a smaller one, or an intermediate box that covers both."""
     ground_size = GroundSizeFilter(CAMERA, CONFIG)
     tracker = Tracker(CAMERA, TrackingConfig(), LOCALISATION, ground_size, PseudoLidarConfig())
     standing = []

@@ -103,9 +103,6 @@ def test_intermittent_features_are_each_detected(seed: int, count: int) -> None:
         assert fixed.dtype == bool
 
 
-# --- the pattern on the glass ---
-
-
 @pytest.mark.parametrize("step_m", [0.3, 1.0, 3.0])
 def test_mean_image_is_over_distance_and_suppresses_the_road(step_m: float) -> None:
     """What is seen for 3 m is in it with the same weight at any rate, so that it can't pull lengths."""
@@ -136,9 +133,6 @@ def test_new_pattern_restarts_the_mean_image() -> None:
     assert fixed_pattern.present
     left = fixed_pattern.subtract(grey, TOP_PX).astype(np.float64)
     assert float((left * pattern).sum() / (pattern**2).sum()) < 0.3 * 4.0  # of a mean over all 40 images 0.6
-
-
-# --- the bonnet ---
 
 
 def road_image(rng: np.random.Generator) -> np.ndarray:

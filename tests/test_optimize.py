@@ -80,9 +80,6 @@ def alone(frames: int) -> list[Estimate]:
     return _alone()[:frames]
 
 
-# --- frames without measurements ---
-
-
 def test_a_frame_is_overdue_when_its_estimate_could_not_come_in_time() -> None:
     budgets = BudgetsConfig(end_to_end_ms=150.0, optimize_ms=12.0, optimize_to_planner_ms=8.0)
     assert deadline_ns(Configuration(budgets=budgets)) == 130 * MS
@@ -200,9 +197,6 @@ def test_published_frame_numbers_never_fall(lateness: list[int], seed: int) -> N
     assert then == alone(41)[40]
 
 
-# --- restarts ---
-
-
 def after(frame_id: int) -> Assignment:
     """The input of the next process if that frame was the last one sent."""
     return Assignment(1, "was killed by SIGKILL", Resume(frame_id + 1, 0, 0))
@@ -277,9 +271,6 @@ def test_checkpoint_that_crashes_is_used_once(tmp_path: Path) -> None:
     for restored in (True, False):  # the first of them dies before it has kept another
         node = OptimizeNode(configuration(tmp_path), Bus(past=DRIVE[15:23]), after(19))
         assert (node.receive(0.0) is not None) == restored  # what has come since the checkpoint
-
-
-# --- the file ---
 
 
 def overwrite(path: Path, start: int, data: bytes) -> None:

@@ -84,7 +84,6 @@ def follow(used: list[int | None], noise_px: float = 0.5) -> tuple[list[tuple[fl
 @given(st.lists(st.integers(0, 4), min_size=FRAMES, max_size=FRAMES))
 @settings(max_examples=5)
 def test_late_detections_give_the_same_vehicles(delays: list[int]) -> None:
-    """A detector that takes `delays` frames, one image at a time."""
     used: list[int | None] = []
     at_work: tuple[int, int] | None = None
     found: int | None = None

@@ -101,8 +101,6 @@ def test_the_readme_names_each_file() -> None:
     assert text.endswith("\n")
 
 
-# --- one factor on all lengths ---
-
 PLACES = st.builds(SE2, st.floats(-500.0, 500.0), st.floats(-500.0, 500.0), st.floats(-3.0, 3.0))
 
 

@@ -244,7 +244,6 @@ def test_every_query_has_a_reply(join: Any) -> None:
 
 
 def test_no_reply_is_reported_as_none(join: Any, base: Path) -> None:
-    """Fresh, then nothing, then fresh again: each is a reading."""
     join("supervisor", hub=True)
     optimize = join("optimize")
     out = optimize.publisher("estimate")

@@ -376,7 +376,6 @@ def test_recorder_restarts_with_a_new_file_until_the_disk_is_full(
     drive: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """The drive goes on each time."""
     place = tmp_path_factory.mktemp("r")
     files = [place / "r.mcap", place / "r-2.mcap"]
     with (

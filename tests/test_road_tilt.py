@@ -70,7 +70,6 @@ def test_other_directions_have_little_effect() -> None:
 
 @pytest.mark.parametrize("curvature_per_m", [0.0008, -0.0008])
 def test_lines_meet_higher_in_a_sag(curvature_per_m: float) -> None:
-    """Their target is on the road at the stated distance."""
     lines = fit_vanishing_point(CAMERA, CONFIG, segments(0.01, 0.0, curvature_per_m), 0.01, 0.0, 0.0)
     there = plane_normal(0.01 + curvature_per_m * lines.distance_m, 0.0)[0]
     assert abs(float(there @ lines.direction)) < lines.sigma_rad

@@ -109,9 +109,6 @@ def test_obstructions_on_a_motorway_are_reported(effect: str) -> None:
     assert sum(told) >= 0.3 * len(told)
 
 
-# --- how much a comparison of the road is believed ---
-
-
 def test_road_comparison_is_consistent_with_its_sigma() -> None:
     """Of a motion that is disturbed at random the length is measured; its error over its sigma is 1 in the mean."""
     drive = read(DemoRecording(stride=TOWN_STRIDE, directory=DIRECTORY), None, 24)
@@ -131,9 +128,6 @@ def test_road_comparison_is_consistent_with_its_sigma() -> None:
         joined = both @ (np.linalg.solve(fit.cov, fit.state) + np.linalg.solve(known, prior))
         squares.append(joined[0] ** 2 / both[0, 0])
     assert 0.1 < float(np.mean(squares)) < 2.0
-
-
-# --- what is drawn over images ---
 
 
 @pytest.fixture(scope="module")
@@ -188,9 +182,6 @@ def test_smooth_road_freezes_under_compression() -> None:
     shown = [encoder.code(np.clip(90.0 + grain[:, k : k + 128], 0, 255).astype(np.uint8)) for k in range(0, 9, 3)]
     assert np.abs(shown[1].astype(int) - shown[0]).max() <= 1
     assert encoder.code(np.full((64, 128), 200, np.uint8)).mean() > 150.0  # another scene is coded
-
-
-# --- rendered again ---
 
 
 @pytest.mark.slow

@@ -232,7 +232,6 @@ def test_lines_and_the_ego_lane() -> None:
 
 @given(st.text("abz09_/*$#?% .é-", max_size=30))
 def test_name_matches_only_its_own_key(name: str) -> None:
-    """Whatever somebody calls a topic or a namespace: it is refused, or the key is one plain key."""
     for checked in (lambda: topic_key(0, name, "std_msgs/msg/String", NO_HASH), lambda: check_namespace(name)):
         try:
             found = checked()

@@ -89,9 +89,6 @@ def test_smoothing_never_worsens_any_motion() -> None:
         assert smoothed < 0.9 * live, name
 
 
-# --- one vehicle's measurements ---
-
-
 def measured(
     xs_m: Floats,
     log_heights: Floats | float = 0.4,

@@ -96,8 +96,6 @@ def test_only_the_table_compares_scheme_names() -> None:
     assert found == []
 
 
-# --- a new source: this file, and one entry ---
-
 TOY_FILE = '''
 """Toy drives: one numpy file of images."""
 

@@ -253,7 +253,6 @@ def test_planner_sends_only_permitted_queries(vehicle: Vehicle, certificates: Pa
 
 @needs_openssl
 def test_outsiders_cannot_write(vehicle: Vehicle, certificates: Path) -> None:
-    """A planner with all its rights sends valid messages of every topic, tokens and answers: none comes in."""
     with outside(certificates, vehicle.port) as session, outside(certificates, vehicle.port) as other:
         heard = hear(vehicle, other, keys(READABLE))
         for listener in vehicle.listeners.values():
@@ -292,7 +291,6 @@ def test_outsiders_cannot_write(vehicle: Vehicle, certificates: Path) -> None:
 
 @needs_openssl
 def test_only_the_car_may_publish_speed(vehicle: Vehicle, certificates: Path) -> None:
-    """Beside it a planner with all its rights, and whoever is not on the list."""
     with outside(certificates, vehicle.port, "car") as car, ExitStack() as others:
         heard = Heard()
         heard.listen(others.enter_context(outside(certificates, vehicle.port, "car")))
@@ -330,7 +328,6 @@ def test_only_the_car_may_publish_speed(vehicle: Vehicle, certificates: Path) ->
 
 @needs_openssl
 def test_the_example_of_a_car(vehicle: Vehicle, certificates: Path, tmp_path: Path) -> None:
-    """From elsewhere by its certificate, and on the vehicle's own sockets."""
     text = (DEPLOY / "car.json5").read_text().replace(":7447", f":{vehicle.port}")
     text = re.sub(r'"(ca|car)\.(pem|key)"', lambda m: json.dumps(str(certificates / m[0].strip('"'))), text)
     (tmp_path / "car.json5").write_text(text)
@@ -602,7 +599,6 @@ def is_refused(payload: bytes, attachment: bytes | None) -> bool:
 
 
 def test_a_flood_of_mutants_reaches_no_planner(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """On the vehicle's own bus: of 3,000 mutated messages each one that is no estimate is counted, none handed out."""
     base, chance = tmp_path_factory.mktemp("run"), Chance(6)
     good = encode(estimate(3))
     refused = 0

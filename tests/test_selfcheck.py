@@ -205,9 +205,6 @@ def test_stop_keeps_the_scale(recorded: tuple[Camera, list[Image]]) -> None:
     assert all(e.valid for e in estimates[36:])
 
 
-# --- height: boxes made by the law that they are read by, with the spread of real cars ---
-
-
 def _edge(vehicle: int, frame: int, box_px: tuple[float, float, float, float]) -> VehicleEdge:
     return VehicleEdge(vehicle=vehicle, frame=frame, T_ego_vehicle=SE2(), cov=(1.0,) * 9, box_px=box_px)
 

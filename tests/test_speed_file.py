@@ -153,9 +153,6 @@ def test_bad_speed_files_of_an_evaluation_are_one_line(tmp_path: Path, capsys: p
         assert wanted in capsys.readouterr().err
 
 
-# --- tables with named columns ---
-
-
 @given(st.permutations(["time_s", "speed_kmh", "sigma_mps", "note"]), st.floats(0.0, 200.0))
 def test_named_columns_may_be_in_any_order(columns: list[str], kmh: float) -> None:
     cells = {"time_s": "1.5", "speed_kmh": repr(kmh), "sigma_mps": "0.25", "note": "wet"}

@@ -94,9 +94,6 @@ def test_a_flood_leaves_the_newest_and_is_counted(caplog: pytest.LogCaptureFixtu
     assert len(encode(FrameRef(**stamps, speeds=(full,) * MAX_READINGS))) < 32_000  # half of a message
 
 
-# --- capture ---
-
-
 class Source:
     """A camera whose frames a test lets go, by CLOCK_MONOTONIC; or a recording."""
 
@@ -222,9 +219,6 @@ def test_a_repeatable_run_ignores_the_bus(
     node.close()
 
 
-# --- in a recording ---
-
-
 @given(st.lists(st.integers(0, 3), max_size=12), st.data())
 def test_frame_adds_readings_since_the_previous_one(said: list[int], data: st.DataObject) -> None:
     """From a car with varying readings; equal ones may be merged."""
@@ -275,9 +269,6 @@ def test_recording_restores_the_readings_of_frames(tmp_path: Path) -> None:
     once = (*said[:11], *said[12:20])  # one that only the lost frame bore is not there
     assert [one["t_ns"] for one in drawn] == [r.t_ns for r in once]
     assert [one["speed_mps"] for one in drawn] == [None if math.isnan(r.speed_mps) else r.speed_mps for r in once]
-
-
-# --- what the metres rest on ---
 
 
 def test_estimate_reports_its_scale_source() -> None:

@@ -148,7 +148,6 @@ def test_planners_see_the_status() -> None:
 
 
 def test_stationary_vehicle_has_one_position_and_follows_when_it_starts() -> None:
-    """Its edges err by up to 1.5 m; the position in world stays, its covariance shrinks, and a start is followed."""
     rng, graph, told = np.random.default_rng(1), PoseGraph(GraphConfig(), WeightsConfig()), []
     for k in range(70):
         started_s = max(0.0, (k - 45) / 10.0)
@@ -192,8 +191,6 @@ def test_size_error_does_not_average_out() -> None:
     assert 0.1 < nees[sigma][1] < 1.5
     assert nees[0.0][1] > nees[sigma][1]
 
-
-# --- the ego ---
 
 STILL_PX, PX_PER_M, DT_S = ZeroVelocityConfig().still_px, 10.0, 0.03
 

@@ -44,7 +44,6 @@ def see(
 
 
 def test_stopped_ego_keeps_its_road() -> None:
-    """With cars in sight, and for a minute without any."""
     pitch_rad, ground_size = 0.02, GroundSizeFilter(CAMERA, CONFIG)
     for k in range(40):
         see(ground_size, [box_px(x + 8.0 - 0.2 * k, y, 1.53, pitch_rad) for x, y in CARS_M], 0.2)

@@ -67,7 +67,6 @@ def test_parked_cars_keep_their_ids_and_places_as_the_ego_passes() -> None:
 
 
 def test_prediction_depends_on_the_motion_state() -> None:
-    """A parked car keeps its position, a moving one its speed."""
     drive = Drive(noise_px=0.5)
     for k in range(30):
         parked, drives = SE2(45.0, -5.0), SE2(20.0 + 1.4 * k, 4.0)
@@ -318,7 +317,6 @@ def test_car_is_not_associated_with_objects_behind_it(label: str) -> None:
 
 
 def test_each_filter_has_exactly_one_row_per_track() -> None:
-    """Cars come and go in any order; each keeps its motion state."""
     drive = Drive(noise_px=0.3)
     tall = SE2(70.0, -8.0)
     for k in range(60):

@@ -73,7 +73,6 @@ def test_a_recording_becomes_a_file_of_reruns(tape: Tape, tmp_path: Path) -> Non
 
 @needs_rerun
 def test_everything_of_a_drive_is_sent(tape: Tape) -> None:
-    """What goes to the stream, entity by entity."""
     from birdslam.runtime.recording import rerun_view as view
 
     class Stream:

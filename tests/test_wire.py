@@ -388,7 +388,6 @@ def without_what_lacks(record: Any, plain: Any) -> Any:
 
 @by_name
 def test_older_messages_still_decode(name: str) -> None:
-    """With the fields that they lack at their defaults; none has become another one since."""
     example = BY_NAME[name]
     for path in versions(name)[:-1]:
         older = without_what_lacks(example, msgpack.unpackb(path.read_bytes()))
@@ -654,7 +653,6 @@ def test_fields_of_any_content_are_refused_or_valid(data: st.DataObject, example
 @settings(max_examples=60)
 @given(st.randoms(use_true_random=False), st.sampled_from(EXAMPLES), st.sampled_from(EXAMPLES))
 def test_mutated_messages_never_do_harm(chance: random.Random, example: msgspec.Struct, other: msgspec.Struct) -> None:
-    """Flipped, lost, doubled and foreign bytes; 50 mutants of each draw."""
     good, donor = encode(example), encode(other)
     for _ in range(50):
         data = bytearray(good)
@@ -674,7 +672,6 @@ def test_mutated_messages_never_do_harm(chance: random.Random, example: msgspec.
 
 
 def test_the_topology_is_closed() -> None:
-    """Each topic has the producer that sends it, and every node receives what some node sends."""
     for node in (*PROCESSES.values(), CAR):
         assert all(TOPICS[topic].producer == node.name for topic in node.sends)
         assert all(TOPICS[topic].producer in {*NODES, MAP.name, CAR.name} for topic in node.receives)
