@@ -123,10 +123,17 @@ class Tape:
         """A frame is overdue."""
         self.take(Message(Overdue(ref), self._trace("capture"), self._now_ns))
 
-    def step(self, measurements: Measurements) -> None:
-        """A frame as it should be."""
-        self.frame(measurements)
-        self.take(self.send(measurements))
+    def step(self, *frames: Measurements) -> None:
+        """Frames as they should be."""
+        for measurements in frames:
+            self.frame(measurements)
+            self.take(self.send(measurements))
+
+    def lose(self, *frames: Measurements) -> None:
+        """Frames that the optimizer does not take up."""
+        for measurements in frames:
+            self.frame(measurements)
+            self.send(measurements)
 
     def restart(self, with_checkpoint: bool, noticed: bool = True) -> None:
         """The optimizer is killed, and restarted."""

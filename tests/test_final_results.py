@@ -102,11 +102,9 @@ def test_new_epoch_continues_in_the_same_file(tmp_path: Path) -> None:
     frames = measured(60)
     (tmp_path / "t").mkdir()
     tape = Tape(tmp_path / "t")
-    for measurements in frames[:30]:
-        tape.step(measurements)
+    tape.step(*frames[:30])
     tape.restart(with_checkpoint=False)
-    for measurements in frames[30:]:
-        tape.step(measurements)
+    tape.step(*frames[30:])
     tape.end(frames[-1])
     write_live(tape, tmp_path / "out")
     smooth([tape.path], tmp_path / "out")

@@ -229,8 +229,7 @@ def test_a_full_disk_ends_the_recording_with_its_last_whole_chunk(
     os_write = os.write
     monkeypatch.setattr(appendonly.os, "write", write)
     tape = Tape(tmp_path)
-    for measurements in measured(80):
-        tape.step(measurements)
+    tape.step(*measured(80))
     tape.close()
     assert tape.writer.error.errno == errno.ENOSPC
     assert tape.path.stat().st_size == tape.writer.written_bytes <= 30_000

@@ -6,7 +6,7 @@ import argparse
 import itertools
 import math
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import msgspec
@@ -35,16 +35,17 @@ def options(recording: Path, values: Sequence[str] = (), output: Path | None = N
     return parse(["replay", str(recording), *settings, *(("--output", str(output)) if output else ())])
 
 
-def verdict_of(tape: Tape) -> Verdict:
+def verdict_after(tape: Tape, frames: Iterable[Measurements]) -> Verdict:
+    """Of a drive that ends after these frames."""
+    *_, last = rest = list(frames)
+    tape.step(*rest)
+    tape.end(last)
     return compare(Recording(tape.path))
 
 
 def test_replay_reproduces_estimates_and_map(tmp_path: Path) -> None:
     tape, frames = Tape(tmp_path), measured(50)
-    for measurements in frames:
-        tape.step(measurements)
-    tape.end(frames[-1])
-    verdict = verdict_of(tape)
+    verdict = verdict_after(tape, frames)
     assert verdict.same
     assert verdict.equal == 51  # the end too
     assert verdict.maps > 0
@@ -68,7 +69,7 @@ def test_first_difference_is_named_to_the_last_bit(tmp_path: Path) -> None:
             )
         tape.step(measurements)
     tape.end(frames[-1])
-    verdict = verdict_of(tape)
+    verdict = compare(Recording(tape.path))
     assert not verdict.same
     assert verdict.equal == 17
     assert verdict.difference.frame_id == frames[17].frame_id
@@ -79,18 +80,14 @@ def test_first_difference_is_named_to_the_last_bit(tmp_path: Path) -> None:
 
 def test_coasted_frames_and_late_measurements_are_replayed(tmp_path: Path) -> None:
     tape, frames = Tape(tmp_path), measured(30)
-    for measurements in frames[:10]:
-        tape.step(measurements)
+    tape.step(*frames[:10])
     first, second = tape.frame(frames[10]), tape.frame(frames[11])
     tape.coast(first)
     tape.coast(second)
     tape.take(tape.send(frames[10]))  # late: the newest frame is published again
     tape.take(tape.send(frames[11]))
-    for measurements in frames[12:]:
-        tape.step(measurements)
-    tape.end(frames[-1])
+    verdict = verdict_after(tape, frames[12:])
     assert [e.frame_id - frames[10].frame_id for e in tape.estimates[10:15]] == [0, 1, 1, 1, 2]
-    verdict = verdict_of(tape)
     assert verdict.same
     assert verdict.coasted == 2
     assert verdict.equal == len(tape.estimates)
@@ -99,16 +96,12 @@ def test_coasted_frames_and_late_measurements_are_replayed(tmp_path: Path) -> No
 def test_frame_written_after_its_prediction_is_replayed(tmp_path: Path) -> None:
     """As by a recorder that had to wait for a core."""
     tape, frames = Tape(tmp_path), measured(20)
-    for measurements in frames[:10]:
-        tape.step(measurements)
+    tape.step(*frames[:10])
     late = FrameRef(**stamps(frames[10]))
     tape.coast(late)
     tape.writer.add("frame", late, tape.tick())
     tape.take(tape.send(frames[10]))
-    for measurements in frames[11:]:
-        tape.step(measurements)
-    tape.end(frames[-1])
-    verdict = verdict_of(tape)
+    verdict = verdict_after(tape, frames[11:])
     assert verdict.same, verdict.difference
     assert (verdict.unknown, verdict.coasted, verdict.equal) == (0, 1, len(tape.estimates))
 
@@ -116,19 +109,13 @@ def test_frame_written_after_its_prediction_is_replayed(tmp_path: Path) -> None:
 @pytest.mark.parametrize("with_checkpoint", [True, False])
 def test_restarts_of_the_optimizer(tmp_path: Path, with_checkpoint: bool) -> None:
     tape, frames = Tape(tmp_path), measured(40)
-    for measurements in frames[:20]:
-        tape.step(measurements)
-    for measurements in frames[20:23]:  # while it is dead
-        tape.frame(measurements)
-        tape.send(measurements)
+    tape.step(*frames[:20])
+    tape.lose(*frames[20:23])  # while it is dead
     tape.restart(with_checkpoint)
-    for measurements in frames[23:]:
-        tape.step(measurements)
-    tape.end(frames[-1])
+    verdict = verdict_after(tape, frames[23:])
     told_of = {status for estimate in tape.estimates for status in estimate.status}
     assert (Status.GRAPH_RESTORED in told_of) == with_checkpoint
     assert (Status.GRAPH_RESET in told_of) != with_checkpoint
-    verdict = verdict_of(tape)
     assert verdict.same, verdict.difference
     assert verdict.equal == len(tape.estimates)
     assert verdict.restarts == 1
@@ -140,18 +127,14 @@ def test_measurements_of_a_frame_published_before_the_restart_enter_the_restored
 ) -> None:
     """Its frame was coasted over, and the measurements came as the optimizer was dead."""
     tape, frames = Tape(tmp_path), measured(40)
-    for measurements in frames[:20]:
-        tape.step(measurements)
+    tape.step(*frames[:20])
     tape.coast(tape.frame(frames[20]))
     tape.send(frames[20])
     tape.restart(with_checkpoint=True)
     tape.coast(tape.frame(frames[21]))
     assert Status.GRAPH_RESTORED in tape.estimates[-1].status
     tape.take(tape.send(frames[21]))
-    for measurements in frames[22:]:
-        tape.step(measurements)
-    tape.end(frames[-1])
-    verdict = verdict_of(tape)
+    verdict = verdict_after(tape, frames[22:])
     assert verdict.same, verdict.difference
     assert verdict.equal == len(tape.estimates)
     assert (verdict.restarts, verdict.epochs, verdict.unanswered) == (1, 1, 1)
@@ -160,11 +143,9 @@ def test_measurements_of_a_frame_published_before_the_restart_enter_the_restored
 def test_graph_from_an_old_checkpoint_is_compared_after_a_new_epoch(tmp_path: Path) -> None:
     """Perceive was too busy to send what came since: that checkpoint is in no recording."""
     tape, frames = Tape(tmp_path), iter(measured(40))
-    for measurements in itertools.islice(frames, 15):
-        tape.step(measurements)
+    tape.step(*itertools.islice(frames, 15))
     old = checkpoint_path(tape.configuration).read_bytes()
-    for measurements in itertools.islice(frames, 5):
-        tape.step(measurements)
+    tape.step(*itertools.islice(frames, 5))
     checkpoint_path(tape.configuration).write_bytes(old)
     tape.perceive.forget(0)
     tape.restart(with_checkpoint=True)
@@ -173,11 +154,8 @@ def test_graph_from_an_old_checkpoint_is_compared_after_a_new_epoch(tmp_path: Pa
         tape.step(coasting)
     assert Status.GRAPH_RESTORED in tape.estimates[20].status
     assert tape.estimates[21].epoch == 0
-    for measurements in frames:
-        tape.step(measurements)
-    tape.end(measurements)
+    verdict = verdict_after(tape, frames)
     assert Status.GRAPH_RESET in tape.estimates[22].status
-    verdict = verdict_of(tape)
     assert verdict.difference is None, verdict.difference.frame_id
     assert (verdict.unknown, verdict.restarts, verdict.epochs) == (2, 1, 2)
     assert verdict.equal == len(tape.estimates) - 2
@@ -186,20 +164,14 @@ def test_graph_from_an_old_checkpoint_is_compared_after_a_new_epoch(tmp_path: Pa
 def test_long_restart_is_replayed(tmp_path: Path) -> None:
     """The checkpoint is whole, but nothing ties it to the oldest of them: a new world, and nothing was restored."""
     tape, frames = Tape(tmp_path), measured(60)
-    for measurements in frames[:20]:
-        tape.step(measurements)
-    for measurements in frames[20:45]:
-        tape.frame(measurements)
-        tape.send(measurements)
+    tape.step(*frames[:20])
+    tape.lose(*frames[20:45])
     tape.perceive.forget(10)
     tape.restart(with_checkpoint=True)
-    for measurements in frames[45:]:
-        tape.step(measurements)
-    tape.end(frames[-1])
+    verdict = verdict_after(tape, frames[45:])
     told_of = {status for estimate in tape.estimates for status in estimate.status}
     assert Status.GRAPH_RESET in told_of
     assert Status.GRAPH_RESTORED not in told_of
-    verdict = verdict_of(tape)
     assert verdict.same, verdict.difference
     assert (verdict.restarts, verdict.epochs) == (1, 2)
     assert verdict.equal == len(tape.estimates)
@@ -207,28 +179,19 @@ def test_long_restart_is_replayed(tmp_path: Path) -> None:
 
 def test_new_epoch_without_restart_is_a_difference(tmp_path: Path) -> None:
     tape, frames = Tape(tmp_path), measured(20)
-    for measurements in frames[:10]:
-        tape.step(measurements)
+    tape.step(*frames[:10])
     tape.restart(with_checkpoint=False, noticed=False)
-    for measurements in frames[10:]:
-        tape.step(measurements)
-    tape.end(frames[-1])
-    verdict = verdict_of(tape)
+    verdict = verdict_after(tape, frames[10:])
     assert verdict.difference.frame_id == frames[10].frame_id
 
 
 def test_lost_measurements_end_the_comparison_until_a_new_epoch(tmp_path: Path) -> None:
     tape, frames = Tape(tmp_path), measured(40)
-    for measurements in frames[:10]:
-        tape.step(measurements)
+    tape.step(*frames[:10])
     tape.frame(frames[10])
     tape.take(tape.send(frames[10], recorded=False))
-    for measurements in frames[11:20]:
-        tape.step(measurements)
-    for measurements in frames[21:]:  # frame 20 never came to the optimizer: it restarts
-        tape.step(measurements)
-    tape.end(frames[-1])
-    verdict = verdict_of(tape)
+    tape.step(*frames[11:20])
+    verdict = verdict_after(tape, frames[21:])  # frame 20 never came to the optimizer: it restarts
     assert verdict.same
     assert verdict.unknown == 10
     assert verdict.equal == 10 + 19 + 1
@@ -239,18 +202,14 @@ def test_lost_measurements_end_the_comparison_until_a_new_epoch(tmp_path: Path) 
 @pytest.mark.parametrize("restart", [False, True])
 def test_new_epoch_with_lost_first_estimate_is_not_a_difference(tmp_path: Path, missing: str, restart: bool) -> None:
     tape, frames = Tape(tmp_path), measured(40)
-    for measurements in frames[:10]:
-        tape.step(measurements)
+    tape.step(*frames[:10])
     tape.frame(frames[10])
     tape.send(frames[10])  # never comes to the optimizer, which restarts with the next
     if restart:
         tape.restart(with_checkpoint=False)
     tape.take(tape.send(frames[11], recorded=missing == "estimate"), recorded=False)
-    for measurements in frames[12:]:
-        tape.step(measurements)
-    tape.end(frames[-1])
+    verdict = verdict_after(tape, frames[12:])
     assert tape.estimates[-1].epoch == 1
-    verdict = verdict_of(tape)
     assert verdict.difference is None, (verdict.difference, verdict)
     if missing == "estimate":
         assert (verdict.equal, verdict.unknown) == (len(tape.estimates) - 1, 0)
@@ -263,22 +222,16 @@ def test_new_epoch_with_lost_first_estimate_is_not_a_difference(tmp_path: Path, 
 def test_epoch_of_a_process_killed_before_its_estimates_is_replayed(tmp_path: Path, lost: int, dead: int) -> None:
     """The next process restores the checkpoint of an unpublished epoch."""
     tape, frames = Tape(tmp_path), iter(measured(40))
-    for measurements in itertools.islice(frames, 10):
-        tape.step(measurements)
+    tape.step(*itertools.islice(frames, 10))
     tape.restart(with_checkpoint=False)
     for measurements in itertools.islice(frames, lost):
         tape.frame(measurements)
         tape.take(tape.send(measurements), recorded=False)
-    for measurements in itertools.islice(frames, dead):  # between the two
-        tape.frame(measurements)
-        tape.send(measurements)
+    tape.lose(*itertools.islice(frames, dead))  # between the two
     tape.restart(with_checkpoint=True)
-    for measurements in frames:
-        tape.step(measurements)
-    tape.end(measurements)
+    verdict = verdict_after(tape, frames)
     heard = [estimate.status for estimate in tape.estimates if estimate.frame_id > 10 + lost]
     assert Status.GRAPH_RESET not in {status for each in heard for status in each}
-    verdict = verdict_of(tape)
     assert verdict.difference is None, verdict.difference.frame_id
     assert (verdict.restarts, verdict.epochs, verdict.unknown) == (2, 2, 0)
     assert verdict.equal == len(tape.estimates) - lost
@@ -287,16 +240,12 @@ def test_epoch_of_a_process_killed_before_its_estimates_is_replayed(tmp_path: Pa
 def test_an_estimate_that_cannot_be_compared_is_not_replayed_twice(tmp_path: Path) -> None:
     """The frame that was coasted over as the world restarted is not in the recording."""
     tape, frames = Tape(tmp_path), measured(40)
-    for measurements in frames[:10]:
-        tape.step(measurements)
+    tape.step(*frames[:10])
     tape.coast(FrameRef(frame_id=frames[12].frame_id, t_source_ns=0, t_capture_ns=0, t_utc_ns=0))
     tape.take(tape.send(frames[11]))  # the one before it was dropped on its way
     assert Status.GRAPH_RESET in tape.estimates[-1].status
     tape.take(tape.send(frames[12]))
-    for measurements in frames[13:]:
-        tape.step(measurements)
-    tape.end(frames[-1])
-    verdict = verdict_of(tape)
+    verdict = verdict_after(tape, frames[13:])
     assert verdict.difference is None, (verdict.difference, verdict)
     assert (verdict.equal, verdict.unknown) == (len(tape.estimates) - 2, 2)
 
@@ -337,7 +286,7 @@ def test_random_restarts_give_no_difference(events: list[str], seed: int) -> Non
             last = next(frames)
             tape.step(last)
         tape.end(last)
-        verdict = verdict_of(tape)
+        verdict = compare(Recording(tape.path))
         assert verdict.difference is None, (verdict.difference, verdict)
         unheard = ("estimate lost", "new world lost", "new world killed")
         assert verdict.equal + sum(event in unheard for event in events) == len(tape.estimates)
@@ -349,8 +298,7 @@ def test_random_restarts_give_no_difference(events: list[str], seed: int) -> Non
 @pytest.mark.parametrize("late", [False, True])
 def test_file_from_the_middle_of_a_drive_replays_from_its_checkpoint(tmp_path: Path, late: bool) -> None:
     tape, frames = Tape(tmp_path), measured(40)
-    for measurements in frames[:15]:
-        tape.step(measurements)
+    tape.step(*frames[:15])
     kept = newest_checkpoint(checkpoint_path(tape.configuration))
     tape.writer.close({})
     path = tmp_path / "drive-2.mcap"
@@ -364,11 +312,9 @@ def test_file_from_the_middle_of_a_drive_replays_from_its_checkpoint(tmp_path: P
         tape.coast(coasted)
         tape.take(first)
         tape.take(tape.send(frames[16]))
-    for measurements in frames[17 if late else 15 : 30]:
-        tape.step(measurements)
+    tape.step(*frames[17 if late else 15 : 30])
     tape.restart(with_checkpoint=True)
-    for measurements in frames[30:]:
-        tape.step(measurements)
+    tape.step(*frames[30:])
     tape.end(frames[-1])
     recording = Recording(path)
     verdict = compare(recording)
@@ -381,8 +327,7 @@ def test_file_from_the_middle_of_a_drive_replays_from_its_checkpoint(tmp_path: P
 
 def test_truncated_recording_replays_up_to_its_end(tmp_path: Path) -> None:
     tape, frames = Tape(tmp_path), measured(40)
-    for measurements in frames:
-        tape.step(measurements)
+    tape.step(*frames)
     tape.close()
     whole = tape.path.read_bytes()
     tape.path.write_bytes(whole[: len(whole) // 2])
@@ -396,8 +341,7 @@ def test_truncated_recording_replays_up_to_its_end(tmp_path: Path) -> None:
 
 def test_last_estimates_of_a_truncated_file_may_lack_measurements(tmp_path: Path) -> None:
     tape, frames = Tape(tmp_path), measured(20)
-    for measurements in frames[:10]:
-        tape.step(measurements)
+    tape.step(*frames[:10])
     for measurements in frames[10:12]:  # over the slower link, and the recorder was killed meanwhile
         tape.frame(measurements)
         tape.take(tape.send(measurements, recorded=False))
@@ -413,8 +357,7 @@ def test_last_estimates_of_a_truncated_file_may_lack_measurements(tmp_path: Path
 
 def test_another_back_end_writes_results(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tape, frames = Tape(tmp_path), measured(30)
-    for measurements in frames:
-        tape.step(measurements)
+    tape.step(*frames)
     tape.end(frames[-1])
     for name, values in (("same", ()), ("paper", ("method=paper",))):
         assert replay_command.run(options(tape.path, values, tmp_path / name)) == 0
@@ -434,8 +377,7 @@ def test_another_back_end_writes_results(tmp_path: Path, capsys: pytest.CaptureF
 
 def test_the_graph_is_written_as_g2o(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tape, frames = Tape(tmp_path), measured(12)
-    for measurements in frames:
-        tape.step(measurements)
+    tape.step(*frames)
     tape.end(frames[-1])
     asked = options(tape.path, ("slam.weights.mode=paper",))
     asked.g2o = tmp_path / "drive.g2o"
