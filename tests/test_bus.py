@@ -23,7 +23,7 @@ import zenoh
 from birdslam.geometry.se2 import SE2
 from birdslam.runtime.client import Planner, Reading
 from birdslam.runtime.topology import key_of
-from birdslam.runtime.transport.bus import Bus, BusClosed, BusError, MessagesLost, Subscriber
+from birdslam.runtime.transport.bus import Bus, BusClosed, BusError, MessagesLost, Publisher, Subscriber
 from birdslam.runtime.transport.endpoints import MAX_UNPACKED
 from birdslam.runtime.transport.presence import VehicleBusy, VehicleLock, ring_path, runtime_dir_of, socket_path
 from birdslam.runtime.wire import MAX_MESSAGE_BYTES, Stage, Trace, encode
@@ -62,6 +62,21 @@ def received(subscriber: Subscriber, timeout_s: float = LIMIT_S) -> Any:
     message = subscriber.recv(timeout_s)
     assert message is not None, "nothing came"
     return message
+
+
+def matched_publisher(bus: Bus, topic: str) -> Publisher:
+    """A publisher whose subscribers are there."""
+    out = bus.publisher(topic)
+    assert out.wait_matched(LIMIT_S)
+    return out
+
+
+def send(out: Publisher, records: list[Any], *subscribers: Subscriber) -> None:
+    """Waits until the last one has come."""
+    for record in records:
+        out.put(record)
+    for each in subscribers:
+        until(lambda each=each: each.newest and each.newest.record == records[-1], "the last record")
 
 
 def until(condition: Any, what: str) -> None:
@@ -111,11 +126,8 @@ def test_topics_of_one_sender_keep_their_order(join: Any) -> None:
 def test_a_hot_topic_delivers_the_newest_message(join: Any) -> None:
     hub = join("supervisor", hub=True)
     frames = hub.subscriber("frame")
-    out = join("capture", lossless=True).publisher("frame")  # so that zenoh itself drops none of them
-    assert out.wait_matched(LIMIT_S)
-    for frame_id in range(10):
-        out.put(frame_ref(frame_id))
-    until(lambda: frames.newest and frames.newest.record.frame_id == 9, "the newest frame")
+    out = matched_publisher(join("capture", lossless=True), "frame")  # so that zenoh itself drops none of them
+    send(out, [frame_ref(k) for k in range(10)], frames)
     assert received(frames).record.frame_id == 9
     assert frames.recv(0.0) is None
     assert frames.dropped == 9
@@ -124,12 +136,8 @@ def test_a_hot_topic_delivers_the_newest_message(join: Any) -> None:
 def test_a_bounded_queue_keeps_the_last_and_counts_drops(join: Any) -> None:
     hub = join("supervisor", hub=True)
     queue, short = hub.subscriber("measurements"), hub.subscriber("measurements", depth=2)
-    out = join("perceive", lossless=True).publisher("measurements")
-    assert out.wait_matched(LIMIT_S)
-    for frame_id in range(20):
-        out.put(measurements(frame_id))
-    until(lambda: queue.newest and queue.newest.record.frame_id == 19, "the last record")
-    until(lambda: short.newest and short.newest.record.frame_id == 19, "the last record")
+    out = matched_publisher(join("perceive", lossless=True), "measurements")
+    send(out, [measurements(k) for k in range(20)], queue, short)
     assert [received(queue).record.frame_id for _ in range(8)] == list(range(12, 20))
     assert [received(short).record.frame_id for _ in range(2)] == [18, 19]
     assert (queue.dropped, short.dropped) == (12, 18)
@@ -138,11 +146,8 @@ def test_a_bounded_queue_keeps_the_last_and_counts_drops(join: Any) -> None:
 def test_queued_messages_are_kept_as_bytes(join: Any) -> None:
     hub = join("supervisor", hub=True)
     queue = hub.subscriber("measurements", depth=64)
-    out = join("perceive", lossless=True).publisher("measurements")
-    assert out.wait_matched(LIMIT_S)
-    for frame_id in range(40):
-        out.put(measurements(frame_id))
-    until(lambda: queue.newest and queue.newest.record.frame_id == 39, "the last record")
+    out = matched_publisher(join("perceive", lossless=True), "measurements")
+    send(out, [measurements(k) for k in range(40)], queue)
     waiting = list(queue._queue)  # private: what waits shows in memory alone
     assert sum(not hasattr(each, "record") for each in waiting) == 40 - MAX_UNPACKED
     came = [received(queue) for _ in range(40)]
@@ -154,8 +159,7 @@ def test_queued_messages_are_kept_as_bytes(join: Any) -> None:
 def test_malformed_messages_are_counted(join: Any, base: Path, caplog: pytest.LogCaptureFixture) -> None:
     hub = join("supervisor", hub=True)
     estimates = hub.subscriber("estimate", depth=16)
-    out = join("optimize", lossless=True).publisher("estimate")
-    assert out.wait_matched(LIMIT_S)
+    out = matched_publisher(join("optimize", lossless=True), "estimate")
     key, good = key_of("car", "estimate"), encode(estimate(1))
     with foreign_session(base) as foreign:
 
@@ -188,8 +192,7 @@ def test_malformed_messages_are_counted(join: Any, base: Path, caplog: pytest.Lo
 def test_lost_messages_are_counted(join: Any, base: Path) -> None:
     hub = join("supervisor", hub=True)
     estimates = hub.subscriber("estimate", depth=16)
-    out = join("optimize", lossless=True).publisher("estimate")
-    assert out.wait_matched(LIMIT_S)
+    out = matched_publisher(join("optimize", lossless=True), "estimate")
     numbers = [("optimize", n) for n in (4, 5, 9, 1, 2)]  # 6 to 8 are lost; then it restarts
     with foreign_session(base) as foreign:
         block, urgent = zenoh.CongestionControl.BLOCK, zenoh.Priority.REAL_TIME
@@ -234,8 +237,7 @@ def test_only_the_topics_own_records_are_sent(join: Any) -> None:
 def test_lossless_messages_all_arrive_at_a_slow_reader(join: Any) -> None:
     join("supervisor", hub=True, lossless=True)
     frames = join("perceive", lossless=True).subscriber("frame")
-    out = join("capture", lossless=True).publisher("frame")
-    assert out.wait_matched(LIMIT_S)
+    out = matched_publisher(join("capture", lossless=True), "frame")
     sender = threading.Thread(target=lambda: [out.put(frame_ref(frame_id)) for frame_id in range(200)])
     sender.start()
     got = []
@@ -249,8 +251,7 @@ def test_lossless_messages_all_arrive_at_a_slow_reader(join: Any) -> None:
 
 def test_a_record_that_must_arrive_waits_for_a_full_link(join: Any) -> None:
     frames = join("perceive", hub=True).subscriber("frame", depth=1)
-    out = join("capture").publisher("frame")
-    assert out.wait_matched(LIMIT_S)
+    out = matched_publisher(join("capture"), "frame")
     count = 2_000  # twice what the socket and the queue before it take
     last = threading.Thread(target=out.put, args=(frame_ref(count),), kwargs={"must_arrive": True})
     with frames._arrived:  # private: the reader's thread can't go on
@@ -267,8 +268,7 @@ def test_overflow_of_a_lossless_queue_is_reported(join: Any, monkeypatch: pytest
     monkeypatch.setattr("birdslam.runtime.transport.bus.LOSSLESS_DEPTH", 4)
     hub = join("supervisor", hub=True, lossless=True)
     frames, tolerant = hub.subscriber("frame"), hub.subscriber("frame", may_drop=True)
-    out = join("capture", lossless=True).publisher("frame")
-    assert out.wait_matched(LIMIT_S)
+    out = matched_publisher(join("capture", lossless=True), "frame")
     for frame_id in range(9):
         out.put(frame_ref(frame_id))
     for each in (frames, tolerant):
@@ -321,8 +321,7 @@ def test_vehicles_do_not_receive_each_others_messages(base: Path) -> None:
         Bus("two", "capture", runtime_dir=base) as node,
     ):
         wrong, right = one.subscriber("frame"), two.subscriber("frame")
-        out = node.publisher("frame")
-        assert out.wait_matched(LIMIT_S)
+        out = matched_publisher(node, "frame")
         out.put(frame_ref(1))
         assert received(right).record == frame_ref(1)
         assert wrong.recv(0.1) is None
