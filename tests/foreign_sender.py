@@ -13,10 +13,15 @@ from birdslam.runtime.transport.session import session_config
 
 
 @contextmanager
-def foreign_session(base: Path, vehicle: str = "car", as_hub: bool = False) -> Iterator[zenoh.Session]:
-    """A session that only connects to the hub, as a planner's does; or the one that all connect to."""
+def foreign_session(
+    base: Path, vehicle: str = "car", as_hub: bool = False, patient: bool = False
+) -> Iterator[zenoh.Session]:
+    """A session that only connects to the hub, as a planner's does; or the one that all connect to.
+
+    `patient`: no silence on a busy machine closes its links to those that are `lossless`.
+    """
     hub = [socket_path(runtime_dir_of(vehicle, base), "hub")]
-    with zenoh.open(session_config(hub if as_hub else [], [] if as_hub else hub, False)) as session:
+    with zenoh.open(session_config(hub if as_hub else [], [] if as_hub else hub, patient)) as session:
         yield session
 
 

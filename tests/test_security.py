@@ -603,8 +603,8 @@ def test_a_flood_of_mutants_reaches_no_planner(tmp_path_factory: pytest.TempPath
     good = encode(estimate(3))
     refused = 0
     with (
-        foreign_session(base, as_hub=True) as foreign,
-        Bus("car", "planner-0", runtime_dir=base) as another,
+        foreign_session(base, as_hub=True, patient=True) as foreign,
+        Bus("car", "planner-0", runtime_dir=base, lossless=True) as another,
         Planner("car", base) as planner,
     ):
         counting = another.subscriber("estimate")
