@@ -7,12 +7,9 @@ what was sent before has come.
 from __future__ import annotations
 
 import io
-import json
 import os
 import re
-import shutil
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -39,6 +36,7 @@ from birdslam.runtime.transport.bus import Bus, BusClosed, BusError, Publisher
 from birdslam.runtime.wire import Health, encode
 from birdslam.types import Estimate
 from tests.test_bus import estimate, measurements, until
+from tests.tls import certificate, connect_to, free_port, insert, needs_openssl
 
 ROOT = Path(__file__).resolve().parent.parent
 LIMIT_S = 60.0
@@ -47,7 +45,6 @@ NAMES = ("red", "green", "blue")
 _LETTERS = "abzAZ09-_*$#?/ .@\n\0é\u0661"
 
 processes = pytest.mark.processes
-needs_openssl = pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl is not installed")
 
 
 # --- names and keys: no processes ---
@@ -128,10 +125,6 @@ def test_vehicle_may_write_only_its_own_keys(names: list[str], data: st.DataObje
 def tls(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Certificates of the router, three vehicles and two listeners; in `other`, a vehicle of another authority."""
     folder = tmp_path_factory.mktemp("tls")
-
-    def certificate(place: Path, *what: str) -> None:
-        subprocess.run([str(ROOT / "deploy/certificates.sh"), str(place), *what], check=True, capture_output=True)
-
     certificate(folder, "router", "127.0.0.1", "localhost")
     for name in NAMES:
         certificate(folder, "uplink", name)
@@ -143,10 +136,8 @@ def tls(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def port() -> Iterator[int]:
-    with socket.socket() as holder:  # reserved meanwhile
-        holder.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        holder.bind(("127.0.0.1", 0))
-        yield int(holder.getsockname()[1])
+    with free_port() as number:
+        yield number
 
 
 def router_table(tls: Path, port: int, **changes: Any) -> RouterConfig:
@@ -271,22 +262,8 @@ def test_one_listener_follows_three_vehicles(tmp_path_factory: pytest.TempPathFa
 def raw_config(tls: Path, port: int, name: str, authority: str = "ca.pem", limit_s: float = LIMIT_S) -> zenoh.Config:
     """A session without our client's manners."""
     config = zenoh.Config()
-    settings = {
-        "mode": "client",
-        "connect/endpoints": [f"tls/127.0.0.1:{port}"],
-        "connect/timeout_ms": round(1e3 * limit_s),
-        "connect/exit_on_failure": True,
-        "scouting/multicast/enabled": False,
-        "transport/link/protocols": ["tls"],
-        "transport/link/tls": {
-            "enable_mtls": bool(name),
-            "root_ca_certificate": str(tls / authority),
-            "connect_certificate": str(tls / f"{name}.pem") if name else None,
-            "connect_private_key": str(tls / f"{name}.key") if name else None,
-        },
-    }
-    for key, value in settings.items():
-        config.insert_json5(key, json.dumps(value))
+    insert(config, {"mode": "client", "scouting/multicast/enabled": False, "transport/link/protocols": ["tls"]})
+    insert(config, connect_to(port, tls, name, authority, limit_s))
     return config
 
 

@@ -9,14 +9,13 @@ import json
 import os
 import re
 import select
-import shutil
 import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -37,6 +36,7 @@ from birdslam.types import Estimate, MapUpdate, SpeedReading
 from tests.foreign_sender import foreign_session
 from tests.mutations import Chance, mutated
 from tests.test_bus import estimate, measurements, until
+from tests.tls import certificate, connect_to, free_port, insert, needs_openssl
 
 pytestmark = pytest.mark.processes
 
@@ -45,12 +45,6 @@ DEPLOY = ROOT / "deploy"
 LIMIT_S = 60.0
 ASKABLE = {*QUERIES, "estimate", "map_pose", *(f"health/{node}" for node in PROCESSES)}
 READABLE = {"estimate", "map", "map_pose", *(f"health/{node}" for node in PROCESSES)}
-
-needs_openssl = pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl is not installed")
-
-
-def certificate(folder: Path, *what: str) -> None:
-    subprocess.run([str(DEPLOY / "certificates.sh"), str(folder), *what], check=True, capture_output=True)
 
 
 @pytest.fixture(scope="module")
@@ -63,15 +57,6 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
     certificate(folder, "planner", "stranger")
     certificate(folder, "car")
     return folder
-
-
-@contextmanager
-def free_port() -> Iterator[int]:
-    """A reserved port for a gate."""
-    with socket.socket() as holder:
-        holder.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        holder.bind(("127.0.0.1", 0))
-        yield int(holder.getsockname()[1])
 
 
 def gate_file(folder: Path, certificates: Path, port: int, change: Callable[[str], str] = lambda text: text) -> Path:
@@ -94,23 +79,10 @@ def outside(
 ) -> zenoh.Session:
     """A session from outside, by the planner's file that is installed. Raises ZError where it is not let in."""
     config = zenoh.Config.from_file(str(DEPLOY / "planner.json5"))
-    tls = {
-        "enable_mtls": bool(name),
-        "verify_name_on_connect": True,
-        "root_ca_certificate": str(certificates / authority),
-        "connect_certificate": str(certificates / f"{name}.pem") if name else None,
-        "connect_private_key": str(certificates / f"{name}.key") if name else None,
-    }
-    for key, value in (
-        ("mode", mode),
-        ("listen/endpoints", []),
-        ("transport/link/protocols", ["tls", "unixsock-stream"]),  # as one who would go past the gate
-        ("connect/endpoints", [f"tls/127.0.0.1:{port}"]),
-        ("connect/timeout_ms", round(1e3 * limit_s)),
-        ("connect/exit_on_failure", True),
-        ("transport/link/tls", tls),
-    ):
-        config.insert_json5(key, json.dumps(value))
+    settings = connect_to(port, certificates, name, authority, limit_s)
+    settings["transport/link/tls"]["verify_name_on_connect"] = True
+    protocols = ["tls", "unixsock-stream"]  # as one who would go past the gate
+    insert(config, {"mode": mode, "listen/endpoints": [], "transport/link/protocols": protocols} | settings)
     return zenoh.open(config)
 
 
@@ -378,13 +350,8 @@ REFUSED = (
 
 def without_tls(port: int) -> zenoh.Session:
     config = zenoh.Config()
-    for key, value in (
-        ("mode", "client"),
-        ("connect/endpoints", [f"tcp/127.0.0.1:{port}"]),
-        ("connect/timeout_ms", 1500),
-        ("scouting/multicast/enabled", False),
-    ):
-        config.insert_json5(key, json.dumps(value))
+    endpoint = {"connect/endpoints": [f"tcp/127.0.0.1:{port}"], "connect/timeout_ms": 1500}
+    insert(config, {"mode": "client", "scouting/multicast/enabled": False} | endpoint)
     return zenoh.open(config)
 
 
