@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from itertools import product
 from pathlib import Path
 
@@ -51,6 +50,7 @@ from birdslam.types import (
     LineKind,
     VehicleLane,
 )
+from tests.calls import calls
 from tests.records import new_estimate, new_vehicle
 
 CAMERA = Camera(640, 240, 420.0, 420.0, 319.5, 90.0, height_m=1.5)
@@ -623,18 +623,8 @@ def test_cost_per_road_user_is_low() -> None:
     lanes = EgoLane().lanes(tuple(line(k, 8.7 - 3.5 * k) for k in range(6)), 0)
 
     def calls_for(count: int) -> int:
-        users, calls = crowd(count), [0]
-
-        def counting(frame: object, event: str, argument: object) -> None:
-            calls[0] += event == "call"
-
-        before = sys.getprofile()
-        sys.setprofile(counting)
-        try:
-            with_users(lanes, users, 10.0, Traffic())
-        finally:
-            sys.setprofile(before)
-        return calls[0]
+        users = crowd(count)
+        return calls(lambda: with_users(lanes, users, 10.0, Traffic()), "call")
 
     assert (calls_for(40) - calls_for(20)) / 20 < 60  # 600 before
 

@@ -69,6 +69,8 @@ from birdslam.types import (
     VehicleEstimate,
     VehicleLane,
 )
+from tests.calls import calls
+from tests.mutations import mutated
 
 GOLDEN = Path(__file__).parent / "golden"
 
@@ -534,22 +536,7 @@ def test_finite_check_is_vectorized() -> None:
     """For a record of thousands of numbers that was three quarters of the time it takes to encode it."""
     estimate = BY_NAME["Estimate"]
     crowded = msgspec.structs.replace(estimate, people=estimate.people * 100)
-
-    def calls_for(record: msgspec.Struct) -> int:
-        calls = [0]
-
-        def counting(frame: object, event: str, argument: object) -> None:
-            calls[0] += event == "c_call"
-
-        before = sys.getprofile()
-        sys.setprofile(counting)
-        try:
-            encode(record)
-        finally:
-            sys.setprofile(before)
-        return calls[0]
-
-    assert calls_for(crowded) - calls_for(estimate) < 100
+    assert calls(lambda: encode(crowded), "c_call") - calls(lambda: encode(estimate), "c_call") < 100
 
 
 def test_a_message_that_is_too_large_is_never_sent() -> None:
@@ -655,20 +642,7 @@ def test_fields_of_any_content_are_refused_or_valid(data: st.DataObject, example
 def test_mutated_messages_never_do_harm(chance: random.Random, example: msgspec.Struct, other: msgspec.Struct) -> None:
     good, donor = encode(example), encode(other)
     for _ in range(50):
-        data = bytearray(good)
-        for _ in range(chance.randint(1, 4)):
-            place, length = chance.randrange(len(data) + 1), chance.randint(0, 12)
-            start = chance.randrange(len(donor))
-            change = chance.randrange(4)
-            if change == 0 and place < len(data):
-                data[place] = chance.randrange(256)
-            elif change == 1:
-                del data[place : place + length]
-            elif change == 2:
-                data[place:place] = donor[start : start + length]
-            else:
-                data[place : place + length] = donor[start : start + length]
-        accepted_or_refused(bytes(data), type(example))
+        accepted_or_refused(mutated(chance, good, donor), type(example))
 
 
 def test_the_topology_is_closed() -> None:
