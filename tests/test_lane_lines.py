@@ -516,6 +516,9 @@ def line(number: int, y_m: float, kind: LineKind = LineKind.SOLID, existence: fl
     )  # fmt: skip
 
 
+TWO_LANES = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0)  # the ego's is the right one
+
+
 def test_arrow_is_not_a_bound() -> None:
     row = lane_row((line(0, 5.2), line(1, 1.6), line(2, 0.0, existence=0.8), line(3, -1.8)))
     assert [(lane.left, lane.right) for lane in row.lanes] == [(0, 1), (1, 3)]
@@ -570,32 +573,29 @@ def test_a_lane_change_is_one_event() -> None:
 
 @given(st.floats(3.0, 60.0), st.floats(-12.0, 12.0), st.floats(0.0, 4.0), st.floats(-3.1, 3.1))
 def test_lane_probabilities_sum_to_one(x_m: float, y_m: float, sigma_m: float, yaw_rad: float) -> None:
-    lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0)
     vehicle = UserInEgo(7, SE2(x_m, y_m, yaw_rad), np.eye(3) * sigma_m**2, 4.0, 8.0)
-    (place,) = with_users(lanes, [vehicle], 10.0, Traffic()).vehicles
+    (place,) = with_users(TWO_LANES, [vehicle], 10.0, Traffic()).vehicles
     assert place.ego_lane + place.left + place.right + place.oncoming + place.off_road == pytest.approx(1.0)
 
 
 @given(st.lists(st.floats(-400.0, 400.0), max_size=3))
 def test_distant_users_are_in_no_lane(xs_m: list[float]) -> None:
-    lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0)
     users = [UserInEgo(k, SE2(x_m, 0.1, 0.0), np.eye(3) * 0.1, 4.0, 8.0) for k, x_m in enumerate(xs_m)]
-    placed = with_users(lanes, users, 10.0, Traffic()).vehicles
+    placed = with_users(TWO_LANES, users, 10.0, Traffic()).vehicles
     assert [one.vehicle for one in placed] == [k for k, x_m in enumerate(xs_m) if abs(x_m) < MAX_DISTANCE_M]
 
 
 def test_the_leader_is_the_nearest_in_the_egos_lane() -> None:
-    lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0)
     cov = np.diag([0.25, 0.01, 0.001])
     cars = [
         UserInEgo(k, SE2(x, y, 0.0), cov, 4.0, 8.0) for k, x, y in ((1, 30.0, 0.1), (2, 12.0, 3.4), (3, 20.0, -0.3))
     ]
-    found = with_users(lanes, cars, 9.0, Traffic())
+    found = with_users(TWO_LANES, cars, 9.0, Traffic())
     assert found.leader.vehicle == 3
     assert found.leader.gap_m == pytest.approx(18.0)
     assert found.leader.time_gap_s == pytest.approx(2.0)
     assert found.leader.gap_sigma_m == pytest.approx(0.5)
-    standing = with_users(lanes, cars, 0.0, Traffic()).leader
+    standing = with_users(TWO_LANES, cars, 0.0, Traffic()).leader
     assert standing.time_gap_s is None
 
 
@@ -606,10 +606,9 @@ def crowd(count: int) -> list[UserInEgo]:
 
 
 def test_lane_assignment_uses_bounds_and_sigmas() -> None:
-    lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0)
     users = crowd(30)
-    for user, place in zip(users, with_users(lanes, users, 10.0, Traffic()).vehicles, strict=True):
-        own, x, y = lanes.ego, user.T_ego_vehicle.x_m, user.T_ego_vehicle.y_m
+    for user, place in zip(users, with_users(TWO_LANES, users, 10.0, Traffic()).vehicles, strict=True):
+        own, x, y = TWO_LANES.ego, user.T_ego_vehicle.x_m, user.T_ego_vehicle.y_m
         bend = 0.001 * max(0.0, x - own.to_m) ** 2
         sigma = math.sqrt(0.1 + own.sigma_m(min(x, own.to_m)) ** 2 + bend**2 + 1e-6)
         inside = math.erf((own.left_m(x) - y) / sigma / math.sqrt(2)) - math.erf(
@@ -640,11 +639,10 @@ def test_curves_move_in_batch_as_singly() -> None:
 
 
 def test_cyclists_can_be_leaders_and_pedestrians_cannot() -> None:
-    lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0)
     walker = FollowedPerson(person=5, x_m=9.0, y_m=-0.5, cov=(0.2, 0.0, 0.0, 0.05), vx_mps=-1.4, vy_mps=0.0,
                             velocity_cov=(0.1, 0.0, 0.0, 0.1))  # fmt: skip
     cyclist = msgspec.structs.replace(walker, person=6, x_m=25.0, vx_mps=4.0, label="cyclist")
-    found = with_users(lanes, [person_in_ego(walker), person_in_ego(cyclist)], 8.0, Traffic())
+    found = with_users(TWO_LANES, [person_in_ego(walker), person_in_ego(cyclist)], 8.0, Traffic())
     assert [(place.vehicle, place.ego_lane > 0.9) for place in found.vehicles] == [(5, True), (6, True)]
     assert found.vehicles[0].oncoming == 0.0  # pedestrians have no direction of traffic
     assert found.leader.vehicle == 6
@@ -663,16 +661,15 @@ def test_lane_along_the_line_of_sight_needs_no_distance() -> None:
 
 
 def test_vehicles_in_a_used_lane_are_assumed_moving() -> None:
-    lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0)
     cov = np.diag([1.0, 0.04, 0.01])
     new = UserInEgo(9, SE2(40.0, 12.0, math.pi), cov, 4.0, 0.0, 8.0, standing=0.7)
 
     def place_after(others: list[UserInEgo]) -> VehicleLane:
         traffic = Traffic()
         for _ in range(3):  # each counts once
-            with_users(lanes, others, 10.0, traffic)
+            with_users(TWO_LANES, others, 10.0, traffic)
         again = Traffic(msgspec.msgpack.decode(msgspec.msgpack.encode(traffic.state()), type=TrafficState))
-        (place,) = with_users(lanes, [new], 10.0, again).vehicles
+        (place,) = with_users(TWO_LANES, [new], 10.0, again).vehicles
         return place
 
     unknown = place_after([])
@@ -684,11 +681,10 @@ def test_vehicles_in_a_used_lane_are_assumed_moving() -> None:
 
 
 def test_no_parking_at_high_ego_speed() -> None:
-    lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0)
 
     def oncoming(ego_mps: float, standing: float) -> float:
         new = UserInEgo(9, SE2(40.0, 16.0, math.pi), np.diag([1.0, 0.04, 0.01]), 4.0, 0.0, 8.0, standing=standing)
-        (place,) = with_users(lanes, [new], ego_mps, Traffic()).vehicles
+        (place,) = with_users(TWO_LANES, [new], ego_mps, Traffic()).vehicles
         return place.oncoming
 
     assert oncoming(30.0, 0.7) > 0.7 > 0.4 > oncoming(10.0, 0.7)
@@ -788,29 +784,28 @@ def test_cars_along_the_kerb_beyond_a_lane_are_off_road() -> None:
 
 
 def test_traffic_determines_the_direction_of_a_lane() -> None:
-    lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0)
     cov = np.diag([1.0, 0.04, 0.01])
     unknown = UserInEgo(9, SE2(40.0, 3.4, 0.0), np.diag([1.0, 0.04, 3.0]), 4.0, 2.0)
     traffic = Traffic()
-    before = with_users(lanes, [unknown], 10.0, traffic)
+    before = with_users(TWO_LANES, [unknown], 10.0, traffic)
     assert before.lanes[0].oncoming is None
     assert before.lanes[1].oncoming == 0.0
     right = 1.0 / (1.0 + math.exp(-STATED_SIDE_EVIDENCE))
     by_labels = right * 19 / 30 + (1.0 - right) / 14  # as KITTI has them
     assert before.vehicles[0].left == pytest.approx(1.0 - by_labels, abs=0.01)
     for _ in range(3):  # one car counts once
-        told = with_users(lanes, [UserInEgo(1, SE2(30.0, 3.4, math.pi), cov, 4.0, 9.0), unknown], 10.0, traffic)
+        told = with_users(TWO_LANES, [UserInEgo(1, SE2(30.0, 3.4, math.pi), cov, 4.0, 9.0), unknown], 10.0, traffic)
     assert told.lanes[0].oncoming == pytest.approx(1.0 / (1.0 + math.exp(-2.0)))
     assert told.vehicles[1].oncoming > 0.8 > told.vehicles[1].left
     again = Traffic(msgspec.msgpack.decode(msgspec.msgpack.encode(traffic.state()), type=TrafficState))
     for k in range(4):  # cars that drive the ego's way there
         users = [UserInEgo(20 + k, SE2(30.0, 3.4, 0.0), cov, 4.0, 9.0)]
-        assert with_users(lanes, users, 10.0, again) == with_users(lanes, users, 10.0, traffic)
-    (after, _) = with_users(lanes, users, 10.0, traffic).lanes
+        assert with_users(TWO_LANES, users, 10.0, again) == with_users(TWO_LANES, users, 10.0, traffic)
+    (after, _) = with_users(TWO_LANES, users, 10.0, traffic).lanes
     assert after.oncoming < 0.01
     far = UserInEgo(2, SE2(30.0, 3.4, 0.0), np.diag([1.0, 4.0, 0.01]), 4.0, 9.0)
     unsure = Traffic()
-    with_users(lanes, [far], 10.0, unsure)  # it may be in the ego's lane
+    with_users(TWO_LANES, [far], 10.0, unsure)  # it may be in the ego's lane
     assert unsure.state() == TrafficState()
 
 
