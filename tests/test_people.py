@@ -85,8 +85,15 @@ class Scene:
     def ego_m(self) -> float:
         return self.ego_mps * self.k / HZ
 
-    def see(self, detections: Detections | None, road: GroundSizeFilter | None = None) -> tuple[FollowedPerson, ...]:
-        """The next frame."""
+    def see(
+        self, detections: Detections | None, road: GroundSizeFilter | None = None, frames: int = 1
+    ) -> tuple[FollowedPerson, ...]:
+        """The people after the next frames, which all show the same."""
+        for _ in range(frames):
+            people = self._step(detections, road)
+        return people
+
+    def _step(self, detections: Detections | None, road: GroundSizeFilter | None) -> tuple[FollowedPerson, ...]:
         ego = EgoFrame(self.k, round(self.k * 1e9 / HZ), SE2(self.ego_m, 0.0, 0.0), np.zeros((3, 3)))
         dt_s = 0.0 if self.k == 0 else 1.0 / HZ
         frame = OpenFrame(ego, dt_s, 0.0, None, None, self.ego_mps * dt_s)
@@ -142,9 +149,7 @@ def test_bicycle_without_rider_starts_no_track() -> None:
 @settings(max_examples=25)
 def test_stationary_person_is_within_sigma(x_m: float, bearing: float, height_m: float) -> None:
     scene = Scene()
-    for _ in range(3):
-        people = scene.see(found([box_of(x_m, bearing * x_m, height_m)]))
-    (person,) = people
+    (person,) = scene.see(found([box_of(x_m, bearing * x_m, height_m)]), frames=3)
     error = np.array([person.x_m - x_m, person.y_m - bearing * x_m])
     assert error @ np.linalg.solve(np.reshape(person.cov, (2, 2)), error) < 3.0**2
     assert abs(error[0]) < 0.12 * x_m
@@ -167,16 +172,11 @@ PASSERS_BY = [(9.0, -3.0), (12.0, 2.5), (16.0, -4.0), (20.0, 4.0), (25.0, -5.0),
 
 def test_tilt_from_later_people_corrects_earlier_ones() -> None:
     scene, first = Scene(), box_of(18.0, 0.5, rise=RISE)
-    for _ in range(10):
-        people = scene.see(found([first]))
-    (alone,) = people
+    (alone,) = scene.see(found([first]), frames=10)
     others = [box_of(x_m, y_m, height_m, rise=RISE) for (x_m, y_m), height_m in zip(PASSERS_BY, HEIGHTS, strict=True)]
-    for _ in range(10):
-        people = scene.see(found([first, *others]))
+    people = scene.see(found([first, *others]), frames=10)
     together = next(p for p in people if p.person == alone.person)
-    for _ in range(25):
-        people = scene.see(found([first]))
-    (left,) = people
+    (left,) = scene.see(found([first]), frames=25)
     assert abs(together.x_m - 18.0) < 0.9 * abs(alone.x_m - 18.0)
     assert abs(left.x_m - 18.0) < 0.9 * abs(alone.x_m - 18.0)
     assert left.cov[0] < alone.cov[0]
@@ -207,8 +207,7 @@ def test_people_follow_the_vertical_curvature() -> None:
     places = []
     for road in (GroundSizeFilter(CAMERA, GroundSizeConfig()), bent):
         scene = Scene()
-        for _ in range(10):
-            people = scene.see(found([box]), road=road)
+        people = scene.see(found([box]), road=road, frames=10)
         places.append(people[0].x_m)
     level_m, bent_m = places
     assert bent_m == pytest.approx(x_m, rel=0.04)
@@ -225,8 +224,7 @@ def test_truncated_feet_give_no_position() -> None:
 
 def test_hidden_feet_do_not_move_a_tracked_person() -> None:
     scene, (x1, y1, x2, y2) = Scene(), box_of(12.0, 2.0)
-    for _ in range(6):
-        scene.see(found([(x1, y1, x2, y2)]))
+    scene.see(found([(x1, y1, x2, y2)]), frames=6)
     hidden = y2 - 0.45 * (y2 - y1)
     car = (x1 - 60.0, hidden - 15.0, x2 + 60.0, y2 + 30.0)
     for _ in range(6):
@@ -289,8 +287,7 @@ def test_walker_keeps_velocity_and_id_over_one_second_of_occlusion() -> None:
     assert ids == {FIRST_PERSON}
     assert (person.vx_mps, person.vy_mps) == pytest.approx((0.0, -1.3), abs=0.4)
     assert person.moves is Moves.DRIVING
-    for _ in range(20):
-        people = scene.see(found([]))
+    people = scene.see(found([]), frames=20)
     assert people == ()
 
 
@@ -304,8 +301,7 @@ def test_overlapping_people_keep_their_ids() -> None:
     assert nearer.person == FIRST_PERSON
     assert nearer.vy_mps < -0.5
     pair = Scene()
-    for _ in range(10):
-        people = pair.see(found([box_of(10.0, 0.0), box_of(10.0, 0.3)]))
+    people = pair.see(found([box_of(10.0, 0.0), box_of(10.0, 0.3)]), frames=10)
     assert len({p.person for p in people}) == 2
 
 
@@ -330,8 +326,7 @@ def test_far_person_is_not_a_near_one_with_hidden_feet(far_m: float) -> None:
     scene = Scene()
     for _ in range(10):
         (near,) = scene.see(found([box_of(9.0, 0.0)])) or (None,)
-    for _ in range(5):
-        people = scene.see(found([box_of(far_m, 0.0)]))
+    people = scene.see(found([box_of(far_m, 0.0)]), frames=5)
     (far,) = [person for person in people if person.age_ns == 0]
     assert far.person != near.person
     assert far.x_m == pytest.approx(far_m, rel=0.15)
@@ -339,8 +334,7 @@ def test_far_person_is_not_a_near_one_with_hidden_feet(far_m: float) -> None:
 
 def test_skipped_frames_only_grow_the_covariance() -> None:
     scene = Scene()
-    for _ in range(5):
-        scene.see(found([box_of(10.0, 0.0)]))
+    scene.see(found([box_of(10.0, 0.0)]), frames=5)
     (before,) = scene.see(found([box_of(10.0, 0.0)]))
     (after,) = scene.see(None)
     assert after.person == before.person
@@ -466,11 +460,9 @@ def test_example_stops_only_for_a_person_ahead() -> None:
     example = Path(__file__).resolve().parent.parent / "docs" / "examples" / "stop_for_people.py"
     who_stops_us = runpy.run_path(str(example))["who_stops_us"]
     scene = Scene()
-    for _ in range(5):
-        people = scene.see(found([box_of(12.0, 0.4)]))
+    people = scene.see(found([box_of(12.0, 0.4)]), frames=5)
     assert len(who_stops_us(driven(5, *people)[1])) == 1
     aside = Scene()
-    for _ in range(5):
-        people = aside.see(found([box_of(12.0, 7.0)]))
+    people = aside.see(found([box_of(12.0, 7.0)]), frames=5)
     assert len(people) == 1
     assert who_stops_us(driven(5, *people)[1]) == []
