@@ -170,7 +170,7 @@ class _Camera:
                     motion = between(poses[before], poses[frame])
                     if np.hypot(*motion[:2]) < 20.0:  # else another car took its place at the roadside
                         sigma = np.array([config.sigma_vv_m, config.sigma_vv_m, config.sigma_vv_rad])
-                        T, cov = self._noisy(motion, np.diag(sigma**2))
+                        T, cov = self._noisy(motion, sigma**2)
                         vv.append(MotionEdge(vehicle=k, from_frame=before, to_frame=frame, T_from_to=T, cov=cov))
                 last_seen[k] = frame
             out.append(
@@ -190,16 +190,16 @@ class _Camera:
             last = frame
         return out
 
-    def _noisy(self, pose: Floats, cov: Floats) -> tuple[SE2, tuple[float, ...]]:
-        least = (1e-18 + 1e-12 * np.trace(cov)) * np.eye(3)  # an edge may be exact in some direction
-        noise = self.config.noise * (np.linalg.cholesky(cov + least) @ self._rng.standard_normal(3))
+    def _noisy(self, pose: Floats, variances: Floats) -> tuple[SE2, tuple[float, ...]]:
+        least = 1e-18 + 1e-12 * np.sum(variances)  # an edge may be exact in some direction
+        noise = self.config.noise * (np.sqrt(variances + least) * self._rng.standard_normal(3))
         x, y, yaw = compose(pose, noise).tolist()
-        return SE2(x, y, wrap(yaw)), tuple(cov.ravel().tolist())
+        return SE2(x, y, wrap(yaw)), tuple(np.diag(variances).ravel().tolist())
 
     def _ego_edge(self, before: int, frame: int, ego: Floats) -> EgoEdge:
         config = self.config
         sigma = np.array([config.sigma_cc_m, config.sigma_cc_m / 2.0, config.sigma_cc_rad])
-        T, cov = self._noisy(between(ego[before], ego[frame]), np.diag(sigma**2) * (frame - before))
+        T, cov = self._noisy(between(ego[before], ego[frame]), sigma**2 * (frame - before))
         return EgoEdge(from_frame=before, to_frame=frame, T_from_to=T, cov=cov)
 
     def _vehicle_edge(self, vehicle: int, frame: int, seen: Floats, driven_s: float) -> VehicleEdge:
@@ -246,16 +246,14 @@ class _Camera:
             self._next_landmark += 1
         out = []
         variance = config.sigma_cp_m**2
-        for landmark, world in list(self._landmarks.items()):
-            x, y = compose(back, world)[:2]
+        places = compose(back, np.reshape([*self._landmarks.values()], (-1, 3)))
+        for landmark, (x, y, _) in zip([*self._landmarks], places.tolist(), strict=True):
             if x < 4.0:
                 del self._landmarks[landmark]
                 continue
             outlier_m = rng.uniform(2.0, 8.0) if rng.uniform() < config.outliers else 0.0
-            x, y = np.array([x, y]) + config.noise * config.sigma_cp_m * rng.standard_normal(2) + outlier_m
-            out.append(
-                LandmarkEdge(
-                    landmark=landmark, frame=frame, x_m=float(x), y_m=float(y), cov=(variance, 0.0, 0.0, variance)
-                )
-            )
+            noise_x, noise_y = (config.noise * config.sigma_cp_m * rng.standard_normal(2)).tolist()
+            x_m, y_m = x + noise_x + outlier_m, y + noise_y + outlier_m
+            cov = (variance, 0.0, 0.0, variance)
+            out.append(LandmarkEdge(landmark=landmark, frame=frame, x_m=x_m, y_m=y_m, cov=cov))
         return tuple(out)
