@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from birdslam.outputs import bev_picture
 from birdslam.runtime.batch import drive as driving
 from birdslam.runtime.batch import report
 from birdslam.runtime.batch.drive import DRIVES, DriveResult, Failure, Job, done, failure_file, run_drive
@@ -252,7 +253,7 @@ def test_killed_process_fails_only_its_drive(tmp_path: Path, monkeypatch: pytest
 
 @pytest.mark.slow
 @pytest.mark.processes
-def test_a_killed_batch_resumes(tmp_path: Path) -> None:
+def test_a_killed_batch_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Killed during its second drive: the drive's process ends too, and the next batch does the rest."""
     drives = [kitti(tmp_path / "00", 3), kitti(tmp_path / "01", 400)]
     output, alone = tmp_path / "out", tmp_path / "alone"
@@ -273,6 +274,7 @@ def test_a_killed_batch_resumes(tmp_path: Path) -> None:
     before = (output / DRIVES / "00" / "result.json").stat().st_mtime_ns
     assert subprocess.run(command, check=False, stdout=subprocess.DEVNULL).returncode == 0
     assert (output / DRIVES / "00" / "result.json").stat().st_mtime_ns == before
+    monkeypatch.setattr(bev_picture, "DPI", 160)  # as in the processes of the batch
     run_drive(Job(made(drives)[1], str(alone)), lambda *at: None)
     found = contents(output / DRIVES / "01")
     found.pop("report.html", None)  # of a batch where plotly is installed
