@@ -106,6 +106,20 @@ def test_full_noise_costs_no_more_than_five_percent_of_the_batch(sigma_cv_rad: f
         assert ate_ours <= 1.05 * ate_theirs, body
 
 
+def test_the_batch_recovers_a_world_without_noise() -> None:
+    world = drive(DriveConfig(frames=30, vehicles=2, landmarks=6, lane_points=0, noise=0.0), seed=4)
+    for weights in (ALL_EDGES, WeightsConfig(mode="paper")):
+        batch = solve(world.measurements, GraphConfig(constant_velocity=False), weights)
+        assert len(batch.frames) == 30
+        assert batch.vehicles
+        for frame in batch.frames:
+            np.testing.assert_allclose(off(batch.ego(frame), world.ego[frame]), 0.0, atol=1e-6)
+        for vehicle, frames in batch.vehicles.items():
+            for frame in frames:
+                pose = batch.vehicle(vehicle, frame)
+                np.testing.assert_allclose(off(pose, world.vehicles[vehicle][frame]), 0.0, atol=1e-6)
+
+
 @pytest.mark.parametrize("turn_rad", [-1.2, -0.4, 0.6, 1.3])
 def test_a_yaw_that_turns_out_to_be_another_one_leaves_the_place_where_it_is(turn_rad: float) -> None:
     """Seen far away, a car's place is known well across the line of sight and badly along it, whatever its yaw."""

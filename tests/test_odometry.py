@@ -348,6 +348,15 @@ def test_large_lorry_ahead_does_not_bias_the_motion() -> None:
     assert np.linalg.norm(chained[26].p) == pytest.approx(path_m(truth), rel=0.06)
 
 
+@pytest.mark.slow  # at 10 Hz above
+def test_a_turn_on_the_spot_at_33_hz_does_not_travel_either() -> None:
+    truth = street([(0.2, 0.0)] * 14 + [(0.0, 0.004)] * 30)
+    chained, _ = drive(truth, rate_hz=33.0)
+    assert np.linalg.norm(chained[44].p - chained[14].p) < 0.15
+    turned = rotation_log(chained[14].between(chained[44]).R)
+    assert np.linalg.norm(turned) == pytest.approx(0.12, abs=0.005)
+
+
 def test_hidden_road_carries_the_scale_with_status() -> None:
     truth = street([(0.7, 0.0)] * 34)
     hidden = np.zeros((HEIGHT_PX, WIDTH_PX), bool)
